@@ -1,0 +1,43 @@
+"""Names and sizes of every TensorDict entry that passes between the parts.
+
+Extends :mod:`torchrl.data.vla`: the entries that TorchRL already names keep its names. ``*B`` is the batch,
+``C`` the chunk length, ``A`` the action size, images are ``[3, H, W]`` uint8, upright.
+"""
+
+from __future__ import annotations
+
+CHUNK_LENGTH = 8
+ACTION_DIM = 7
+STATE_DIM = 7
+KINEMATIC_DIM = 20
+POSE_DIM = 13
+CONTROL_HZ = 20
+POSITION_STEP = 0.05  # metres for an action of +1
+ROTATION_STEP = 0.5  # radians for an action of +1
+
+IMAGE = ("observation", "image")  # uint8 [*B, 3, H, W], agentview
+WRIST_IMAGE = ("observation", "wrist_image")  # uint8 [*B, 3, H, W]
+STATE = ("observation", "state")  # float32 [*B, 7]: position (m), axis-angle (rad), gripper opening in [0, 1]
+KINEMATIC_STATE = "kinematic_state"  # float32 [*B, 20]: q (7), x_des (3), R_des (9, row-major), gripper opening
+INSTRUCTION = "language_instruction"  # NonTensor str
+TASK_ID = "task_id"  # int64 [*B, 1], index into the task catalogue
+CONTEXT_ID = "context_id"  # int64 [*B, 1], the initial state a rollout started from
+SIM_STATE = "sim_state"  # float64 [*B, S], MuJoCo integration state
+NUM_STEPS = "num_steps"  # int64 [*B, 1], env steps executed since the reset
+
+ACTION = "action"  # float32 [*B, 7], one env action
+CHUNK = ("vla_action", "chunk")  # float32 [*B, C, 7], unclipped Laplace sample
+LOC = ("vla_action", "loc")  # float32 [*B, C, 7]
+SCALE = ("vla_action", "scale")  # float32 [*B, C, 7], exp(log-scale)
+LOG_SCALE = ("vla_action", "log_scale")  # float32 [*B, C, 7], the scale head's raw output
+LOG_PROBS = ("vla_action", "log_probs")  # float32 [*B, C], summed over the 7 dimensions
+ACTION_IS_PAD = "action_is_pad"  # bool [*B, C]
+
+FRAMES = "frames"  # uint8 [*B, C, 3, H, W], what one decision produced
+STATES = "states"  # float32 [*B, C, 7], the proprioception that goes with the frames
+KINEMATIC_STATES = "kinematic_states"  # float32 [*B, C, 20]
+STEP_MASK = "step_mask"  # bool [*B, C], steps of the chunk that were executed
+SUCCESS = "success"  # bool [*B, 1], from the physics
+SUCCESS_PROB = "success_prob"  # float32 [*B, 1], R(o_1:t, g)
+ADVANTAGE = "advantage"  # float32 [*B, 1]
+MASK = ("collector", "mask")  # bool [*B], entries that belong to a rollout (False after its end)
