@@ -1,0 +1,416 @@
+"""The world model as an environment: rollouts without physics."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NonTensorStack, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, NonTensor, Unbounded
+from torchrl.envs import EnvBase
+
+from worldenv_trl.keys import (
+    ACTION_DIM,
+    CHUNK,
+    CONTEXT_ID,
+    FRAMES,
+    IMAGE,
+    INSTRUCTION,
+    KINEMATIC_DIM,
+    KINEMATIC_STATE,
+    KINEMATIC_STATES,
+    NUM_STEPS,
+    POSE_DIM,
+    STATE,
+    STATE_DIM,
+    STATES,
+    STEP_MASK,
+    TASK_ID,
+)
+from worldenv_trl.kinematics.forward import ForwardKinematics
+
+__all__ = ["ImaginedEnv"]
+
+_PADDED_ACTION_DIM = 14  # the world model's dual-arm interface; a single arm fills the first seven
+_CONTEXT_KEYS = (IMAGE, STATE, KINEMATIC_STATE, TASK_ID, CONTEXT_ID)
+
+
+class ImaginedEnv(EnvBase):
+    """Rollouts in a video world model (World-Env section 3.2): one decision, a chunk of actions, is one step.
+
+    Forward kinematics predicts the hand's states over the chunk, the world model paints the frames. Reward is 0 and
+    nothing terminates here: :class:`~worldenv_trl.envs.Reflect` adds both. Rows are [G, N]: G contexts (initial frame,
+    state and instruction), N rollouts of each. The env is batch-locked and honours ``_step``: the world model sees
+    active rows only.
+
+    A rollout is a function of (seed, context, rollout index, how often this row was reset, actions), never of the other
+    rows: the world model gets a noise seed per row and chunk.
+
+    Args:
+        world_model: called on a TensorDict [n] of the active rows with ``("memory", "frames")`` uint8 [n, M, 3, H, W],
+            ``("memory", "poses")`` [n, M, 13], ``("memory", "reference")`` uint8 [n, 3, H, W], ``poses`` [n, C, 13],
+            ``padded_actions`` [n, C, 14], ``task_id`` [n, 1] and ``noise_seed`` int64 [n, 1]; writes ``frames`` uint8
+            [n, C, 3, H, W]. ``world_model.memory_indices(t)``, int64 [n] -> [n, M], says which frames of the video
+            o_0..o_t it remembers, newest last.
+        kinematics: FK(s, a).
+        contexts: TensorDict [K] with the image, state, kinematic state, task id, context id and instruction of K
+            initial states, as :class:`~worldenv_trl.envs.TabletopEnv` writes them at a reset.
+        batch_size: [G, N].
+
+    Keyword Args:
+        max_steps: env steps after which a rollout is truncated; need not be a multiple of the chunk.
+        chunk_length: C.
+        proprio: ``"commanded"`` writes the accumulated target pose as the state (the same number as in physics),
+            ``"measured"`` the pose of the predicted joints.
+        seed: of the contexts' order and of the noise; drawn from torch's generator when None.
+        device: of the specs and buffers; the contexts' when None.
+
+    A reset of a whole group draws its next context, without replacement while that is possible; rows reset while others
+    of their group are running restart their context, so that a group never mixes contexts.
+    ``reset(td, set_state=True)`` starts from the contexts in ``td`` [G, N], always with the same noise.
+    """
+
+    _supports_set_state = True
+
+    def __init__(
+        self,
+        world_model: TensorDictModuleBase,
+        kinematics: ForwardKinematics,
+        contexts: TensorDictBase,
+        batch_size: torch.Size | list[int] | tuple[int, int],
+        *,
+        max_steps: int,
+        chunk_length: int = 8,
+        proprio: str = "commanded",
+        seed: int | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
+        batch = torch.Size(batch_size)
+        if len(batch) != 2 or min(batch) < 1:
+            raise ValueError(f"batch_size must be [contexts, rollouts of each], both at least 1, got {list(batch)}")
+        if max_steps < 1 or chunk_length < 1:
+            raise ValueError(f"max_steps and chunk_length must be at least 1, got {max_steps} and {chunk_length}")
+        if proprio not in ("commanded", "measured"):
+            raise ValueError(f'proprio must be "commanded" or "measured", got {proprio!r}')
+        _check_contexts(contexts)
+        trained_for = getattr(world_model, "chunk_length", chunk_length)
+        if trained_for != chunk_length:
+            raise ValueError(f"the world model paints chunks of {trained_for} frames, chunk_length is {chunk_length}")
+        device = torch.device(device or contexts.device or "cpu")
+        super().__init__(device=device, batch_size=batch)
+
+        self.world_model, self.kinematics = world_model, kinematics
+        self.max_steps, self.chunk_length, self.proprio = int(max_steps), int(chunk_length), proprio
+        self._contexts = contexts.select(*_CONTEXT_KEYS).to(device).contiguous()
+        _check_state(self._contexts, kinematics)
+        self._instructions = _instructions_of(contexts)
+        self._make_specs(tuple(self._contexts[IMAGE].shape[1:]))
+        self._make_buffers(tuple(self._contexts[IMAGE].shape[1:]))
+        self._set_seed(seed)
+
+    # ------------------------------------------------------------------------------------------------- set-up
+
+    def _make_specs(self, image: tuple[int, ...]) -> None:
+        batch, chunk = self.batch_size, self.chunk_length
+
+        def pixels(*shape: int) -> Bounded:
+            return Bounded(0, 255, shape=(*batch, *shape), dtype=torch.uint8, device=self.device)
+
+        def real(*shape: int) -> Unbounded:
+            return Unbounded(shape=(*batch, *shape), device=self.device)
+
+        def integer() -> Unbounded:
+            return Unbounded(shape=(*batch, 1), dtype=torch.int64, device=self.device)
+
+        def nested(**leaves) -> Composite:
+            return Composite(**leaves, shape=batch, device=self.device)
+
+        text = NonTensor(shape=batch, example_data=self._instructions[0], device=self.device)
+        state = {
+            "observation": nested(image=pixels(*image), state=real(STATE_DIM)),
+            KINEMATIC_STATE: real(KINEMATIC_DIM),
+            INSTRUCTION: text,
+            TASK_ID: integer(),
+            CONTEXT_ID: integer(),
+        }
+        self.observation_spec = nested(
+            **state,
+            **{
+                NUM_STEPS: integer(),
+                FRAMES: pixels(chunk, *image),
+                STATES: real(chunk, STATE_DIM),
+                KINEMATIC_STATES: real(chunk, KINEMATIC_DIM),
+                STEP_MASK: Binary(shape=(*batch, chunk), dtype=torch.bool, device=self.device),
+            },
+        )
+        self.state_spec = nested(**state).clone()
+        self.action_spec = nested(
+            vla_action=nested(chunk=Bounded(-1.0, 1.0, shape=(*batch, chunk, ACTION_DIM), device=self.device))
+        )
+        self.reward_spec = real(1)
+        flag = Binary(shape=(*batch, 1), dtype=torch.bool, device=self.device)
+        self.done_spec = nested(done=flag.clone(), terminated=flag.clone(), truncated=flag.clone())
+
+    def _make_buffers(self, image: tuple[int, ...]) -> None:
+        rows, length = self.batch_size.numel(), self.max_steps + self.chunk_length  # the last chunk may overshoot
+
+        def buffer(name: str, *shape: int, dtype: torch.dtype) -> None:
+            self.register_buffer(name, torch.zeros(rows, *shape, dtype=dtype, device=self.device), persistent=False)
+
+        buffer("_video", length, *image, dtype=torch.uint8)  # o_0..o_t of every row: the world model's memory
+        buffer("_poses", length, POSE_DIM, dtype=torch.float32)
+        buffer("_kinematic", 2, KINEMATIC_DIM, dtype=torch.float32)  # at the start, now
+        buffer("_state", 2, STATE_DIM, dtype=torch.float32)
+        buffer("_task", 1, dtype=torch.int64)
+        buffer("_context", 1, dtype=torch.int64)
+        buffer("_steps", dtype=torch.int64)
+        buffer("_decisions", dtype=torch.int64)
+        buffer("_episode", dtype=torch.int64)  # which noise; 0 for contexts given by the caller
+        buffer("_resets", dtype=torch.int64)
+        self._text = [self._instructions[0]] * rows
+        self._text_stack: NonTensorStack | None = None
+        self._begun = [False] * self.batch_size[0]  # groups that have a context
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = int(torch.randint(2**31, ()).item()) if seed is None else int(seed)
+        self._generator = torch.Generator().manual_seed(self._seed)
+        self._queue: list[int] = []
+        self._resets.zero_()
+
+    # ------------------------------------------------------------------------------------------------- reset
+
+    def _draw(self, count: int) -> list[int]:
+        """The next ``count`` contexts: permutation after permutation, no context twice in a draw if it can be."""
+        drawn: list[int] = []
+        while len(drawn) < count:
+            if not self._queue:
+                order = torch.randperm(len(self._contexts), generator=self._generator).tolist()
+                self._queue = [i for i in order if i not in drawn] + [i for i in order if i in drawn]
+            drawn.append(self._queue.pop(0))
+        return drawn
+
+    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDictBase:
+        groups, rollouts = self.batch_size
+        mask = tensordict.get("_reset", None) if tensordict is not None else None
+        if mask is None:
+            mask = torch.ones(groups, rollouts, dtype=torch.bool, device=self.device)
+        mask = mask.reshape(groups, rollouts).clone()
+        whole = [group for group in range(groups) if mask[group].all() or not self._begun[group]]
+        mask[whole] = True
+        rows = mask.flatten().nonzero().squeeze(-1)
+        self._resets[rows] += 1
+        self._steps[rows] = 0
+        self._decisions[rows] = 0
+        if set_state:
+            self._load(rows, *self._given(tensordict, rows))
+            self._episode[rows] = 0
+        else:
+            drawn = self._draw(len(whole))
+            index = torch.tensor(drawn, dtype=torch.int64).repeat_interleave(rollouts)
+            fresh = torch.tensor(whole, dtype=torch.int64)[:, None] * rollouts + torch.arange(rollouts)
+            text = [self._instructions[i] for i in index.tolist()]
+            self._load(fresh.flatten().to(self.device), self._contexts[index.to(self._contexts.device)], text)
+            self._kinematic[rows, 1], self._state[rows, 1] = self._kinematic[rows, 0], self._state[rows, 0]
+            self._episode[rows] = self._resets[rows]
+        self._begun = [True] * groups
+        out = self._observe()
+        out.update(self.full_done_spec.zero())
+        return out
+
+    def _load(self, rows: Tensor, start: TensorDictBase, text: list[str]) -> None:
+        """Put the contexts ``start`` [n] into ``rows`` [n]."""
+        start = start.to(self.device)
+        self._video[rows, 0] = start[IMAGE]
+        self._state[rows] = start[STATE].unsqueeze(1)
+        self._kinematic[rows] = start[KINEMATIC_STATE].unsqueeze(1)
+        self._poses[rows, 0] = self.kinematics.pose(start[KINEMATIC_STATE])
+        self._task[rows], self._context[rows] = start[TASK_ID], start[CONTEXT_ID]
+        for row, words in zip(rows.tolist(), text, strict=True):
+            self._text[row] = words
+        self._text_stack = None
+
+    def _given(self, tensordict: TensorDictBase | None, rows: Tensor) -> tuple[TensorDictBase, list[str]]:
+        """The contexts of ``rows`` that the caller put into the reset's tensordict."""
+        keys = set() if tensordict is None else set(tensordict.keys(True, True))
+        missing = [key for key in _CONTEXT_KEYS if key not in keys]
+        if missing:
+            raise ValueError(f"reset(set_state=True) needs {list(_CONTEXT_KEYS)} in its tensordict; missing: {missing}")
+        start = tensordict.select(*_CONTEXT_KEYS).to(self.device).flatten(0, 1)[rows]
+        if start[IMAGE].shape[1:] != self._video.shape[2:]:
+            raise ValueError(
+                f"the contexts' images are {tuple(start[IMAGE].shape[1:])}, this env's {tuple(self._video.shape[2:])}"
+            )
+        if INSTRUCTION in tensordict.keys():  # noqa: SIM118 - a TensorDict iterates over rows
+            text = _instructions_of(tensordict.select(INSTRUCTION).flatten(0, 1))
+            return start, [text[row] for row in rows.tolist()]
+        by_task = dict(zip(self._contexts[TASK_ID].flatten().tolist(), self._instructions, strict=True))
+        return start, [by_task.get(task, "") for task in start[TASK_ID].flatten().tolist()]
+
+    # ------------------------------------------------------------------------------------------------- step
+
+    @torch.no_grad()
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        chunk = self._checked_chunk(tensordict)
+        active = tensordict.get("_step", None)
+        active = torch.ones_like(self._steps, dtype=torch.bool) if active is None else active.reshape(-1)
+        rows = (active & (self._steps < self.max_steps)).nonzero().squeeze(-1)
+        out = self._observe()
+        if len(rows):
+            if not bool(chunk[rows].isfinite().all()):
+                raise ValueError(f"the action chunk {CHUNK} holds NaN or infinity in an active row")
+            self._imagine(rows, chunk[rows].clamp(-1, 1), out)
+
+        truncated = (self._steps >= self.max_steps).view(*self.batch_size, 1)
+        out["reward"] = torch.zeros(*self.batch_size, 1, device=self.device)
+        for key, value in (("done", truncated), ("terminated", torch.zeros_like(truncated)), ("truncated", truncated)):
+            before = tensordict.get(key, None)  # a row that is not stepped keeps its end, whoever decided it
+            out[key] = value if before is None else torch.where(active.view_as(value), value, before)
+        return out
+
+    def _imagine(self, rows: Tensor, actions: Tensor, out: TensorDictBase) -> None:
+        """Advance ``rows`` [n] by the clipped actions [n, C, 7] and write what they see into ``out``."""
+        count, length = actions.shape[:2]
+        now = self._steps[rows]
+        kinematic = self.kinematics.rollout(self._kinematic[rows, 1], actions)
+        poses = self.kinematics.pose(kinematic)
+        states = self.kinematics.state(kinematic, self.proprio)
+        memory = self.world_model.memory_indices(now)
+        recalled = rows.unsqueeze(-1)
+        request = TensorDict(
+            {
+                "memory": {
+                    "frames": self._video[recalled, memory],
+                    "poses": self._poses[recalled, memory],
+                    "reference": self._video[rows, 0],
+                },
+                "poses": poses,
+                "padded_actions": torch.nn.functional.pad(actions, (0, _PADDED_ACTION_DIM - ACTION_DIM)),
+                TASK_ID: self._task[rows],
+                "noise_seed": self._noise_seeds(rows),
+            },
+            batch_size=[count],
+            device=self.device,
+        )
+        frames = self.world_model(request)[FRAMES]
+        expected = (count, length, *self._video.shape[2:])
+        if tuple(frames.shape) != expected or frames.dtype != torch.uint8:
+            raise ValueError(
+                f"the world model must write uint8 frames {expected}, got {frames.dtype} {tuple(frames.shape)}"
+            )
+
+        offset = torch.arange(1, length + 1, device=self.device)
+        written = now.unsqueeze(-1) + offset
+        self._video[recalled, written] = frames
+        self._poses[recalled, written] = poses
+        executed = (self.max_steps - now).clamp(max=length)  # at least 1: rows at max_steps are not active
+        last = torch.arange(count, device=self.device), executed - 1
+        self._kinematic[rows, 1], self._state[rows, 1] = kinematic[last], states[last]
+        self._steps[rows] += executed
+        self._decisions[rows] += 1
+
+        for key, value in (
+            (FRAMES, frames),
+            (STATES, states),
+            (KINEMATIC_STATES, kinematic),
+            (STEP_MASK, offset <= executed.unsqueeze(-1)),
+            (IMAGE, frames[last]),
+            (STATE, states[last]),
+            (KINEMATIC_STATE, kinematic[last]),
+            (NUM_STEPS, self._steps[rows].unsqueeze(-1)),
+        ):
+            out[key].flatten(0, 1)[rows] = value  # a view: written in place
+
+    def _checked_chunk(self, tensordict: TensorDictBase) -> Tensor:
+        """The actions [G * N, C, 7] of all rows."""
+        expected = (*self.batch_size, self.chunk_length, ACTION_DIM)
+        chunk = tensordict.get(CHUNK, None)
+        if chunk is None:
+            raise ValueError(f"the tensordict holds no action chunk {CHUNK} {expected}: call the policy first")
+        if tuple(chunk.shape) != expected or not chunk.is_floating_point():
+            raise ValueError(
+                f"the action chunk {CHUNK} must be floats {expected}, got {chunk.dtype} {tuple(chunk.shape)}"
+            )
+        return chunk.detach().to(self.device, torch.float32).flatten(0, 1)
+
+    def _noise_seeds(self, rows: Tensor) -> Tensor:
+        """Seeds int64 [n, 1] in [0, 2^62): hash of (seed, context, rollout, episode, decision), not of the row."""
+        parts = (self._context[rows, 0], rows % self.batch_size[1], self._episode[rows], self._decisions[rows])
+        seed = torch.full_like(rows, self._seed)
+        for part in parts:
+            seed = _mix(seed ^ _mix(part + 1))
+        return (seed & (2**62 - 1)).unsqueeze(-1)
+
+    def _observe(self) -> TensorDictBase:
+        """The current observation of all rows, with an empty chunk: what a reset, or a row not stepped, shows."""
+        batch, chunk = self.batch_size, self.chunk_length
+        rows = torch.arange(len(self._steps), device=self.device)
+        if self._text_stack is None:
+            self._text_stack = NonTensorStack(*self._text).reshape(batch)
+
+        def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(*batch, chunk, *shape, dtype=dtype, device=self.device)
+
+        out = TensorDict(
+            {
+                "observation": {
+                    "image": self._video[rows, self._steps].unflatten(0, batch),
+                    "state": self._state[:, 1].clone().unflatten(0, batch),
+                },
+                KINEMATIC_STATE: self._kinematic[:, 1].clone().unflatten(0, batch),
+                TASK_ID: self._task.clone().unflatten(0, batch),
+                CONTEXT_ID: self._context.clone().unflatten(0, batch),
+                NUM_STEPS: self._steps.clone().view(*batch, 1),
+                FRAMES: empty(*self._video.shape[2:], dtype=torch.uint8),
+                STATES: empty(STATE_DIM),
+                KINEMATIC_STATES: empty(KINEMATIC_DIM),
+                STEP_MASK: empty(dtype=torch.bool),
+            },
+            batch_size=batch,
+            device=self.device,
+        )
+        out.set(INSTRUCTION, self._text_stack)
+        return out
+
+
+def _mix(value: Tensor) -> Tensor:
+    """splitmix64 on int64 (wrapping): neighbouring integers become unrelated ones."""
+    value = value + -7046029254386353131
+    value = (value ^ ((value >> 30) & (2**34 - 1))) * -4658895280553007687
+    value = (value ^ ((value >> 27) & (2**37 - 1))) * -7723592293110705685
+    return value ^ ((value >> 31) & (2**33 - 1))
+
+
+def _instructions_of(contexts: TensorDictBase) -> list[str]:
+    text = contexts.get(INSTRUCTION)
+    if isinstance(text, str):
+        return [text] * len(contexts)
+    return [str(words) for words in text.tolist()]
+
+
+def _check_contexts(contexts: TensorDictBase) -> None:
+    if contexts.ndim != 1 or len(contexts) == 0:
+        raise ValueError(
+            f"contexts must be a TensorDict [K] of at least one initial state, got batch size {list(contexts.shape)}; "
+            "collect them with TabletopEnv(...).reset()"
+        )
+    missing = [key for key in (*_CONTEXT_KEYS, INSTRUCTION) if contexts.get(key, None) is None]
+    if missing:
+        raise ValueError(f"contexts lack the entries {missing}; take them from TabletopEnv(...).reset()")
+    count = len(contexts)
+    image = contexts[IMAGE]
+    if image.dtype != torch.uint8 or image.ndim != 4 or image.shape[1] != 3:
+        raise ValueError(f"the contexts' {IMAGE} must be uint8 [K, 3, H, W], got {image.dtype} {tuple(image.shape)}")
+    for key, width in ((STATE, STATE_DIM), (KINEMATIC_STATE, KINEMATIC_DIM), (TASK_ID, 1), (CONTEXT_ID, 1)):
+        if tuple(contexts[key].shape) != (count, width):
+            raise ValueError(f"the contexts' {key} must be {(count, width)}, got {tuple(contexts[key].shape)}")
+
+
+def _check_state(contexts: TensorDictBase, kinematics: ForwardKinematics) -> None:
+    """The proprioception and the joints must tell the same story: both come from the same robot, at rest."""
+    apart = (kinematics.pose(contexts[KINEMATIC_STATE])[:, :3] - contexts[STATE][:, :3]).norm(dim=-1)
+    worst = int(apart.argmax())
+    if not float(apart[worst]) < 0.05:
+        raise ValueError(
+            f"context {int(contexts[CONTEXT_ID][worst])}: its state is {float(apart[worst]):.3f} m away from the "
+            "forward kinematics of its joints; the contexts were recorded with another robot"
+        )
