@@ -24,7 +24,7 @@ from worldenv_trl.keys import (
     STEP_MASK,
     TASK_ID,
 )
-from worldenv_trl.kinematics.forward import ForwardKinematics
+from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.scenes import panda
 
 SIZE, C = 16, 4

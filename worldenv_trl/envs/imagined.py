@@ -27,7 +27,7 @@ from worldenv_trl.keys import (
     STEP_MASK,
     TASK_ID,
 )
-from worldenv_trl.kinematics.forward import ForwardKinematics
+from worldenv_trl.kinematics import ForwardKinematics
 
 __all__ = ["ImaginedEnv"]
 

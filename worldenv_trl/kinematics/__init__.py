@@ -3,5 +3,6 @@
 from __future__ import annotations
 
 from worldenv_trl.kinematics.action_map import ActionMap
+from worldenv_trl.kinematics.forward import ForwardKinematics
 
-__all__ = ["ActionMap"]
+__all__ = ["ActionMap", "ForwardKinematics"]
