@@ -1,0 +1,144 @@
+"""Saving and loading of learned parts: a plain config file beside a safetensors file."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch
+
+CONFIG_NAME = "config.json"
+WEIGHTS_NAME = "model.safetensors"
+
+
+class Pretrained:
+    """Gives an ``nn.Module`` ``save_pretrained(folder)`` and ``from_pretrained(folder)``.
+
+    The module is built from one dataclass: ``__init__(self, config)`` accepts an instance of :attr:`config_class`
+    alone and keeps it as ``self.config``. Parameters and persistent buffers are saved. A config is written with
+    ``dataclasses.asdict`` (arrays as nested lists) and rebuilt as ``config_class(**fields)`` with lists turned into
+    tuples; a config with nested objects or non-string dictionary keys defines the classmethod ``from_dict(fields)``.
+
+    Examples:
+        >>> import dataclasses, tempfile, torch
+        >>> @dataclasses.dataclass(frozen=True)
+        ... class ScaleConfig:
+        ...     dim: int = 3
+        >>> class Scale(torch.nn.Module, Pretrained):
+        ...     config_class = ScaleConfig
+        ...     def __init__(self, config):
+        ...         super().__init__()
+        ...         self.config = config
+        ...         self.weight = torch.nn.Parameter(torch.ones(config.dim))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Scale(ScaleConfig(dim=4)).save_pretrained(folder)
+        ...     Scale.from_pretrained(folder).config
+        ScaleConfig(dim=4)
+    """
+
+    config_class: ClassVar[type]
+    config: Any
+
+    def save_pretrained(self, folder: str | os.PathLike) -> Path:
+        """Writes ``config.json`` and ``model.safetensors`` into ``folder`` (created if missing) and returns it.
+
+        Both files are complete on disk before either replaces an older one of the same name.
+        """
+        folder = Path(folder)
+        if folder.exists() and not folder.is_dir():
+            raise ValueError(f"cannot save {type(self).__name__} to {folder}: it is a file, name a folder")
+        folder.mkdir(parents=True, exist_ok=True)
+        # clone(): safetensors refuses views that share memory, and views would save their whole base.
+        state = {name: t.detach().cpu().contiguous().clone() for name, t in self.state_dict().items()}
+        weights = safetensors.torch.save(state, metadata={"class": type(self).__name__})
+        config = {
+            "class": type(self).__name__,
+            "weights_sha256": hashlib.sha256(weights).hexdigest(),
+            "config": _to_json(dataclasses.asdict(self.config)),
+        }
+        contents = {WEIGHTS_NAME: weights, CONFIG_NAME: (json.dumps(config, indent=2) + "\n").encode()}
+        temporary = {name: folder / f".{name}.{os.getpid()}.tmp" for name in contents}
+        try:
+            for name, data in contents.items():
+                with open(temporary[name], "wb") as file:
+                    file.write(data)
+                    file.flush()
+                    os.fsync(file.fileno())
+            for name in contents:
+                os.replace(temporary[name], folder / name)
+        finally:
+            for path in temporary.values():
+                path.unlink(missing_ok=True)
+        return folder
+
+    @classmethod
+    def from_pretrained(cls, folder: str | os.PathLike, *, device: str | torch.device = "cpu") -> Self:
+        """Rebuilds the module that :meth:`save_pretrained` wrote to ``folder``.
+
+        Raises:
+            FileNotFoundError: if the folder or one of its two files is missing.
+            ValueError: if the checkpoint is truncated, corrupt, or of another class or shape.
+        """
+        folder = Path(folder)
+        for path in (folder, folder / CONFIG_NAME, folder / WEIGHTS_NAME):
+            if not path.exists():
+                raise FileNotFoundError(
+                    f"no {cls.__name__} checkpoint at {folder}: {path} is missing. "
+                    f"Name a folder that {cls.__name__}.save_pretrained wrote."
+                )
+        fields, digest = _read_config(folder / CONFIG_NAME, cls.__name__)
+        try:
+            from_dict = getattr(cls.config_class, "from_dict", None)
+            config = from_dict(fields) if from_dict else cls.config_class(**_to_tuples(fields))
+            module = cls(config)
+        except (TypeError, ValueError, KeyError) as error:
+            raise ValueError(f"{folder / CONFIG_NAME} does not describe a {cls.__name__}: {error}") from error
+        weights = (folder / WEIGHTS_NAME).read_bytes()
+        if digest is not None and hashlib.sha256(weights).hexdigest() != digest:
+            raise ValueError(
+                f"{folder / WEIGHTS_NAME} is truncated, corrupt or not the file that was saved with "
+                f"{CONFIG_NAME} ({len(weights)} bytes). Restore it from a copy or train this part again."
+            )
+        try:
+            module.load_state_dict(safetensors.torch.load(weights))
+        except (safetensors.SafetensorError, RuntimeError) as error:
+            raise ValueError(f"{folder / WEIGHTS_NAME} does not hold the weights of its config: {error}") from error
+        return module.to(device)
+
+
+def _read_config(path: Path, class_name: str) -> tuple[dict, str | None]:
+    try:
+        config = json.loads(path.read_text())
+        saved_class, fields = config["class"], config["config"]
+    except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{path} is not a complete checkpoint config ({error!r}): restore it or train again"
+        ) from error
+    if saved_class != class_name:
+        raise ValueError(f"{path.parent} holds a {saved_class}, not a {class_name}: use {saved_class}.from_pretrained")
+    return fields, config.get("weights_sha256")
+
+
+def _to_json(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _to_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_to_json(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic | torch.Tensor):
+        return value.tolist()
+    return value
+
+
+def _to_tuples(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _to_tuples(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return tuple(_to_tuples(item) for item in value)
+    return value
