@@ -1,0 +1,206 @@
+"""x-prediction network of the video world model: paints a chunk of frames by moving, keeping and repainting pixels."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+__all__ = ["Denoiser"]
+
+_CANDIDATES = 4  # last frame, first frame, moved last frame, painted
+
+
+class Denoiser(nn.Module):
+    """Predicts the clean chunk x_0 from a noisy one, the remembered frames and the hand's path.
+
+    A small UNet over the whole chunk works at ``1 / patch`` of the resolution. Every frame passes through one shared
+    encoder before it and one shared decoder after it, so that the trunk alone pays for time. For every pixel of every
+    frame the decoder chooses, by a softmax, between
+
+    - the last frame (a static pixel is an exact copy: free and sharp),
+    - the first frame (what the arm uncovers),
+    - the last frame moved along with the tool's motion on the image plus a predicted residual flow (the arm, and what
+      it holds or pushes, stay sharp instead of being painted again in every chunk),
+    - freely painted colour.
+
+    Poses, actions, noise level and the reference frame's embedding modulate the residual blocks (FiLM).
+
+    Args:
+        chunk_length: C, frames per call.
+        memory_frames: M, remembered frames, oldest first; index 0 is the first frame of the video, M - 1 the last.
+        image_size: side in pixels.
+        patch: pixels per cell of the network's finest grid.
+        map_channels: channels of the action maps, drawn on the finest grid.
+        condition_dim: size of the vector condition.
+        width: channels of the finest level.
+        multipliers: channels of every level, in units of ``width``.
+        blocks: residual blocks of every level, on the way down and again on the way up.
+        frame_channels: channels of the per-frame encoder.
+        embedding_dim: size of the modulation embedding.
+    """
+
+    def __init__(
+        self,
+        *,
+        chunk_length: int,
+        memory_frames: int,
+        image_size: int,
+        patch: int,
+        map_channels: int,
+        condition_dim: int,
+        width: int,
+        multipliers: tuple[int, ...],
+        blocks: tuple[int, ...],
+        frame_channels: int,
+        embedding_dim: int,
+    ) -> None:
+        super().__init__()
+        self.chunk_length, self.patch = chunk_length, patch
+        cell = 3 * patch**2
+        maps = map_channels + 2
+        widths = [width * factor for factor in multipliers]
+
+        self.condition = nn.Sequential(nn.Linear(condition_dim, embedding_dim), nn.SiLU())
+        self.reference = _ReferenceEncoder(image_size, embedding_dim)
+        self.noise_level = nn.Linear(1, embedding_dim)
+        self.embed = nn.Sequential(nn.Linear(embedding_dim, embedding_dim), nn.SiLU())
+
+        self.memory_in = nn.Conv2d(memory_frames * (cell + maps), width, 3, padding=1)
+        self.frame_in = nn.Conv2d(2 * cell + maps, frame_channels, 3, padding=1)
+        self.merge = nn.Conv2d(chunk_length * frame_channels, width, 1)
+
+        self.down, self.shrink = nn.ModuleList(), nn.ModuleList()
+        self.up, self.grow = nn.ModuleList(), nn.ModuleList()
+        for level, (channels, count) in enumerate(zip(widths, blocks, strict=True)):
+            self.down.append(nn.ModuleList(_Block(channels, embedding_dim) for _ in range(count)))
+            if level + 1 < len(widths):
+                self.shrink.append(nn.Conv2d(channels, widths[level + 1], 3, stride=2, padding=1))
+                self.up.append(nn.ModuleList(_Block(channels, embedding_dim) for _ in range(count)))
+                self.grow.append(nn.Conv2d(widths[level + 1], channels, 1))
+
+        decoder = 3 * frame_channels // 2
+        self.split = nn.Conv2d(width, chunk_length * decoder, 1)
+        self.frame_out = nn.Conv2d(decoder + frame_channels, 2 * frame_channels, 3, padding=1)
+        self.paint = nn.Conv2d(2 * frame_channels, 2 + (_CANDIDATES + 3) * patch**2, 1)
+        nn.init.zeros_(self.paint.weight)
+        with torch.no_grad():
+            self.paint.bias.zero_()
+            self.paint.bias[2 : 2 + patch**2] = 2.0  # starts as a copy of the last frame
+
+        axis = (torch.arange(image_size, dtype=torch.float32) + 0.5) * 2 / image_size - 1
+        self.register_buffer("_base", torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1), persistent=False)
+
+    def forward(
+        self,
+        noisy: Tensor,
+        noise_level: Tensor,
+        memory: Tensor,
+        memory_maps: Tensor,
+        maps: Tensor,
+        motion: Tensor,
+        condition: Tensor,
+        reference: Tensor,
+    ) -> Tensor:
+        """Images are float in [-1, 1].
+
+        Args:
+            noisy: [B, C, 3, H, W], the noisy chunk.
+            noise_level: [B], 0 is pure noise (or nothing known), 1 is clean.
+            memory: [B, M, 3, H, W].
+            memory_maps: [B, M, K + 2, h, w], action maps and tool coordinates of the remembered frames.
+            maps: [B, C, K + 2, h, w], the same of the frames to paint.
+            motion: [B, C, 2], the tool's motion on the image since the last frame, in pixels.
+            condition: [B, D], poses and actions.
+            reference: [B, 3, H, W].
+
+        Returns:
+            x_0 float32 [B, C, 3, H, W].
+        """
+        batch, chunk = noisy.shape[:2]
+        size = noisy.shape[-1]
+        last, first = memory[:, -1], memory[:, 0]
+        embedding = self.condition(condition) + self.reference(reference) + self.noise_level(noise_level.unsqueeze(-1))
+        embedding = self.embed(embedding)
+
+        moved = self._move(last, motion.view(batch, chunk, 1, 1, 2))
+        per_frame = torch.cat([self._cells(moved), self._cells(noisy), maps.flatten(0, 1)], 1)
+        per_frame = F.silu(self.frame_in(per_frame.contiguous(memory_format=torch.channels_last)))
+        remembered = torch.cat([self._cells(memory).unflatten(0, (batch, -1)), memory_maps], 2).flatten(1, 2)
+        trunk = self.memory_in(remembered.contiguous(memory_format=torch.channels_last))
+        trunk = trunk + self.merge(per_frame.unflatten(0, (batch, chunk)).flatten(1, 2))
+
+        skips = []
+        for level, blocks in enumerate(self.down):
+            for block in blocks:
+                trunk = block(trunk, embedding)
+            if level < len(self.shrink):
+                skips.append(trunk)
+                trunk = self.shrink[level](trunk)
+        for level in reversed(range(len(self.up))):
+            trunk = skips[level] + F.interpolate(self.grow[level](trunk), scale_factor=2, mode="nearest")
+            for block in self.up[level]:
+                trunk = block(trunk, embedding)
+
+        decoded = F.silu(self.split(trunk)).unflatten(1, (chunk, -1)).flatten(0, 1)
+        decoded = F.silu(self.frame_out(torch.cat([decoded, per_frame], 1)))
+        painted = self.paint(decoded).float()  # [B C, 2 + 7 patch^2, h, w]
+        flow = F.interpolate(painted[:, :2], scale_factor=self.patch, mode="bilinear", align_corners=False)
+        flow = flow.view(batch, chunk, 2, size, size).permute(0, 1, 3, 4, 2)
+        dense = F.pixel_shuffle(painted[:, 2:].contiguous(), self.patch).view(batch, chunk, _CANDIDATES + 3, size, size)
+        weight = dense[:, :, :_CANDIDATES].softmax(2)
+        moved = self._move(last, motion.view(batch, chunk, 1, 1, 2) + flow)
+        return (
+            weight[:, :, 0:1] * last.unsqueeze(1)
+            + weight[:, :, 1:2] * first.unsqueeze(1)
+            + weight[:, :, 2:3] * moved
+            + weight[:, :, 3:4] * dense[:, :, _CANDIDATES:]
+        )
+
+    def _cells(self, images: Tensor) -> Tensor:
+        """[B, N, 3, H, W] -> [B N, 3 patch^2, h, w]."""
+        return F.pixel_unshuffle(images.flatten(0, 1), self.patch)
+
+    def _move(self, image: Tensor, motion: Tensor) -> Tensor:
+        """``image`` [B, 3, H, W] moved by pixels [B, C, H or 1, W or 1, 2]: [B, C, 3, H, W]."""
+        batch, chunk = motion.shape[:2]
+        size = image.shape[-1]
+        with torch.autocast(image.device.type, enabled=False):
+            grid = self._base - motion.float() * (2 / size)
+            # One call for the whole chunk: the frames are stacked along the height.
+            moved = F.grid_sample(
+                image, grid.reshape(batch, chunk * size, size, 2), padding_mode="border", align_corners=False
+            )
+        return moved.view(batch, 3, chunk, size, size).transpose(1, 2)
+
+
+class _Block(nn.Module):
+    """Residual block with feature-wise modulation."""
+
+    def __init__(self, channels: int, embedding_dim: int) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(8, channels)
+        self.first = nn.Conv2d(channels, channels, 3, padding=1)
+        self.modulation = nn.Linear(embedding_dim, 2 * channels)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1)
+        nn.init.zeros_(self.second.weight)
+        nn.init.zeros_(self.second.bias)
+
+    def forward(self, features: Tensor, embedding: Tensor) -> Tensor:
+        scale, shift = self.modulation(embedding)[..., None, None].chunk(2, 1)
+        hidden = self.first(self.norm(features))
+        return features + self.second(F.silu(hidden * (1 + scale) + shift))
+
+
+class _ReferenceEncoder(nn.Module):
+    """Embedding [B, D] of the reference frame, at a quarter of the resolution."""
+
+    def __init__(self, image_size: int, embedding_dim: int) -> None:
+        super().__init__()
+        self.convolutions = nn.Sequential(
+            nn.AvgPool2d(4), nn.Conv2d(3, 32, 3, 2, 1), nn.SiLU(), nn.Conv2d(32, 32, 3, 2, 1), nn.SiLU(), nn.Flatten()
+        )
+        self.project = nn.Linear(32 * (image_size // 16) ** 2, embedding_dim)
+
+    def forward(self, image: Tensor) -> Tensor:
+        return self.project(self.convolutions(image))
