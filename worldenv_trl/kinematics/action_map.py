@@ -34,7 +34,8 @@ class ActionMap(nn.Module):
     All marks are distance fields, antialiased and differentiable in the pose; a hand behind the camera draws nothing.
 
     Args:
-        camera: one :class:`~worldenv_trl.scenes.camera.Camera`, or a mapping from task id to camera.
+        camera: one :class:`~worldenv_trl.scenes.camera.Camera`, or a mapping from task id to camera; anything with
+            ``position``, ``rotation`` (world from camera, looking along -z) and ``fovy`` or ``fovy_deg`` (degrees).
         size: image side in pixels, or ``(height, width)``. Pixels are square; ``fovy`` spans the height.
 
     Keyword Args:
@@ -77,7 +78,7 @@ class ActionMap(nn.Module):
         lookup[torch.tensor(ids)] = torch.arange(len(ids))
         positions = [torch.as_tensor(cameras[i].position, dtype=torch.float32) for i in ids]
         rotations = [torch.as_tensor(cameras[i].rotation, dtype=torch.float32).reshape(3, 3) for i in ids]
-        fovy = torch.tensor([float(cameras[i].fovy_deg) for i in ids]).deg2rad()
+        fovy = torch.tensor([_fovy_deg(cameras[i]) for i in ids]).deg2rad()
         # The cameras belong to the configuration of whoever uses the map: not to its weights.
         self.register_buffer("_lookup", lookup, persistent=False)
         self.register_buffer("_position", torch.stack(positions), persistent=False)
@@ -190,6 +191,10 @@ class ActionMap(nn.Module):
         # |p - t d|^2 with t the clamped foot of the perpendicular.
         distance = square - fraction * (2 * along - fraction * length)
         return _coverage(distance, half_width) * (1 - 0.5 * fraction)
+
+
+def _fovy_deg(camera: Camera) -> float:
+    return float(camera.fovy_deg if hasattr(camera, "fovy_deg") else camera.fovy)
 
 
 def _coverage(square_distance: Tensor, radius: Tensor) -> Tensor:
