@@ -1,0 +1,31 @@
+"""Image augmentation for imitation from few demonstrations."""
+
+from __future__ import annotations
+
+import torch
+
+
+def random_shift(images: torch.Tensor, pixels: int = 2, generator: torch.Generator | None = None) -> torch.Tensor:
+    """Shifts every image by its own random whole number of pixels; the border repeats the edge (DrQ, arXiv:2004.13649).
+
+    Args:
+        images: ``[*B, 3, H, W]``, any dtype.
+        pixels: largest shift, up, down, left and right.
+        generator: source of the shifts; the global one by default.
+
+    Returns:
+        A new tensor of the same shape and dtype.
+    """
+    if pixels < 0 or pixels >= min(images.shape[-2:]):
+        raise ValueError(f"pixels must be in [0, {min(images.shape[-2:]) - 1}], got {pixels}")
+    if pixels == 0:
+        return images.clone()
+    height, width = images.shape[-2:]
+    flat = images.reshape(-1, *images.shape[-3:])
+    shift = torch.randint(-pixels, pixels + 1, (2, flat.shape[0], 1), generator=generator).to(images.device)
+    # Clamped indices are the repeated border; gathering keeps uint8 as it is.
+    rows = (torch.arange(height, device=images.device) + shift[0]).clamp(0, height - 1)  # [N, H]
+    columns = (torch.arange(width, device=images.device) + shift[1]).clamp(0, width - 1)  # [N, W]
+    index = (rows[:, :, None] * width + columns[:, None, :]).flatten(1)  # [N, H * W]
+    pixels_flat = flat.flatten(2)  # [N, 3, H * W]
+    return pixels_flat.gather(2, index[:, None].expand_as(pixels_flat)).reshape(images.shape)
