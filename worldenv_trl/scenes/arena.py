@@ -1,0 +1,65 @@
+"""Table, floor, lights, camera and robot: what every tabletop scene shares."""
+
+from __future__ import annotations
+
+from dm_control import composer, mjcf
+
+from worldenv_trl.scenes import panda
+from worldenv_trl.scenes.camera import Camera, look_at
+
+AGENTVIEW = look_at("agentview", (0.78, 0.0, 0.60), (-0.03, 0.0, 0.105), 31.0)
+
+
+class TabletopArena:
+    """A table whose top is z = 0 with the robot at its edge; objects and fixtures are attached to it.
+
+    Fixtures are mocap bodies: they never move, and their place belongs to the integration state, so an initial state
+    restores it (LIBERO's initial states do not).
+    """
+
+    def __init__(self, cameras: tuple[Camera, ...] = (AGENTVIEW,)) -> None:
+        self.root = root = mjcf.RootElement(model="scene")
+        root.compiler.angle = "radian"
+        root.option.set_attributes(timestep=panda.TIMESTEP, integrator="implicitfast", cone="elliptic", impratio=10)
+        root.size.nuserdata = panda.USERDATA
+        # Round shapes cost by their facets, and shadows cost most of all (software GL).
+        root.visual.quality.set_attributes(numslices=10, numstacks=6, numquads=1, shadowsize=0)
+        root.visual.map.znear = 0.02
+        root.visual.headlight.set_attributes(ambient=(0.45, 0.45, 0.45), diffuse=(0.45, 0.45, 0.45), specular=(0, 0, 0))
+        root.worldbody.add(
+            "light",
+            pos=(0.4, 0.6, 1.6),
+            dir=(-0.2, -0.35, -0.9),
+            directional=True,
+            castshadow=False,
+            diffuse=(0.35, 0.35, 0.35),
+        )
+        root.worldbody.add("geom", name="table", type="box", pos=(0, 0, -0.02), size=(0.5, 0.7, 0.02), rgba=(0.72, 0.70, 0.66, 1),
+                           friction=(1.0, 0.01, 0.0005), condim=4)  # fmt: skip
+        root.worldbody.add(
+            "geom",
+            name="wall",
+            type="box",
+            pos=(-1.2, 0, 0),
+            size=(0.02, 3, 3),
+            rgba=(0.45, 0.52, 0.50, 1),
+            contype=0,
+            conaffinity=0,
+        )
+        for camera in cameras:
+            root.worldbody.add("camera", name=camera.name, pos=camera.position, xyaxes=camera.axes, fovy=camera.fovy)
+        self.attach(panda.Panda("panda"), pos=panda.BASE_POSITION)
+
+    def attach(self, entity: composer.Entity, pos=(0.0, 0.0, 0.0)) -> None:
+        """Fixes an entity to the world."""
+        self.root.worldbody.add("site", pos=pos, size=(0.001,), rgba=(0, 0, 0, 0)).attach(entity.mjcf_model)
+
+    def add_object(self, entity: composer.Entity) -> None:
+        """Adds an entity that moves freely; its joint is named like the entity."""
+        frame = self.root.attach(entity.mjcf_model)
+        frame.add("freejoint")
+
+    def add_fixture(self, entity: composer.Entity) -> None:
+        """Adds an entity that is placed by the initial state and then never moves."""
+        frame = self.root.attach(entity.mjcf_model)
+        frame.mocap = True

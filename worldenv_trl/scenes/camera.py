@@ -1,0 +1,50 @@
+"""A fixed pinhole camera."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Camera:
+    """MuJoCo's camera: looks along its -z axis, +y is up in the image.
+
+    ``position`` (m) and ``rotation`` (world from camera, row-major nested tuples) place it; ``fovy`` is the vertical
+    field of view in degrees.
+    """
+
+    name: str
+    position: tuple[float, float, float]
+    rotation: tuple[tuple[float, float, float], ...]
+    fovy: float
+
+    def intrinsics(self, size_px: int) -> np.ndarray:
+        """``[3, 3]`` matrix for a square image; pixel centres lie at half-integers."""
+        focal = 0.5 * size_px / math.tan(math.radians(self.fovy) / 2)
+        return np.array([[focal, 0, size_px / 2], [0, focal, size_px / 2], [0, 0, 1]])
+
+    def project(self, points: np.ndarray, size_px: int) -> np.ndarray:
+        """World points ``[..., 3]`` (m) to image coordinates ``[..., 2]`` (x right, y down; px)."""
+        local = (np.asarray(points) - np.array(self.position)) @ np.array(self.rotation)
+        focal = self.intrinsics(size_px)[0, 0]
+        depth = -local[..., 2]
+        return np.stack([size_px / 2 + focal * local[..., 0] / depth, size_px / 2 - focal * local[..., 1] / depth], -1)
+
+    @property
+    def axes(self) -> tuple[float, ...]:
+        """The image's right and up directions in the world, as MJCF's ``xyaxes``."""
+        rotation = np.array(self.rotation)
+        return (*rotation[:, 0], *rotation[:, 1])
+
+
+def look_at(name: str, position: tuple[float, float, float], target: tuple[float, float, float], fovy: float) -> Camera:
+    """A camera at ``position`` whose axis passes through ``target``, upright."""
+    back = np.subtract(position, target)
+    back = back / np.linalg.norm(back)
+    right = np.cross((0.0, 0.0, 1.0), back)
+    right = right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(back, right), back], 1)
+    return Camera(name, tuple(position), tuple(tuple(row) for row in rotation.tolist()), fovy)
