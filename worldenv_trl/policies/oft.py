@@ -345,7 +345,6 @@ class OFTPolicy(nn.Module, Pretrained):
     def _inject_lora(self) -> None:
         import peft  # imported where used: it takes seconds
 
-        # Modulation layers are too small to be worth adapters; everything else linear gets one.
         targets = [name for name, module in self.backbone.named_modules() if isinstance(module, nn.Linear)]
         lora = peft.LoraConfig(r=self.config.lora_rank, lora_alpha=self.config.lora_alpha, target_modules=targets)
         device = next(self.backbone.parameters()).device
