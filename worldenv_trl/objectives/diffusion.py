@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -34,12 +35,13 @@ class DiffusionLoss(LossModule):
     chunk of a row remembers, with probability ``unroll_prob``, what the model itself just painted (detached and
     quantised, as in imagination), otherwise the real frames. So no forward pass is spent on unrolling alone.
 
-    Error per pixel: ``(x - x_0)^2 + l1_weight * |x - x_0|`` with images in [-1, 1], averaged with weight ``1 +
-    moving_weight`` on moving pixels (where the target differs from the reference or the last real frame) and 1 elsewhere.
+    Error per pixel: ``(x - x_0)^2 + l1_weight * |x - x_0|`` with images in [-1, 1], averaged with weight
+    ``1 + moving_weight`` on moving pixels (where the target differs from the reference or the last real frame) and 1
+    elsewhere.
 
-    With probability ``noise_prob`` a row is trained as a flow-matching sample (noise level uniform in [0, 1)), otherwise
-    from zero noise at level 0, the deterministic one-step mode. When a model will only be used deterministically,
-    ``noise_prob=0`` spends everything on that mode.
+    With probability ``noise_prob`` a row is trained as a flow-matching sample (noise level uniform in [0, 1)),
+    otherwise from zero noise at level 0, the deterministic one-step mode. When a model will only be used
+    deterministically, ``noise_prob=0`` spends everything on that mode.
 
     Reads, for B windows: ``("memory", "frames")`` uint8 [B, M, 3, H, W], ``("memory", "poses")`` [B, M, 13],
     ``("memory", "reference")`` uint8 [B, 3, H, W], ``poses`` [B, n C, 13], ``padded_actions`` [B, n C, 14],
@@ -70,7 +72,7 @@ class DiffusionLoss(LossModule):
 
     default_keys = _AcceptedKeys
     world_model: VideoWorldModel
-    out_keys = ["loss_diffusion", "mse", "moving_mse"]
+    out_keys: ClassVar[list[str]] = ["loss_diffusion", "mse", "moving_mse"]
 
     def __init__(
         self,
