@@ -143,12 +143,12 @@ class ActionMap(nn.Module):
         pose = pose.reshape(-1, 13).float()
         if pose.shape[0] == 0:
             return pose.new_zeros(*batch, self.channels, self.height, self.width)
-        if pose.requires_grad and torch.is_grad_enabled():
+        if pose.device.type != "cpu" or (pose.requires_grad and torch.is_grad_enabled()):
             maps = self._draw(pose, index)
         else:
             maps = pose.new_empty(pose.shape[0], self.channels, self.height, self.width)
-            for rows in torch.arange(pose.shape[0]).split(_ROWS_PER_CHUNK):
-                part = slice(int(rows[0]), int(rows[-1]) + 1)
+            for first in range(0, pose.shape[0], _ROWS_PER_CHUNK):
+                part = slice(first, first + _ROWS_PER_CHUNK)
                 maps[part] = self._draw(pose[part], index[part])
         return maps.reshape(*batch, self.channels, self.height, self.width)
 
