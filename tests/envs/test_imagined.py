@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from worldenv_trl.envs.imagined import ImaginedEnv
+from worldenv_trl.envs import ImaginedEnv, TabletopEnv, chunked
 from worldenv_trl.keys import (
     CHUNK,
     CONTEXT_ID,
@@ -22,10 +22,11 @@ from worldenv_trl.keys import (
     STATE,
     STATES,
     STEP_MASK,
+    SUCCESS,
     TASK_ID,
 )
 from worldenv_trl.kinematics import ForwardKinematics
-from worldenv_trl.scenes import panda
+from worldenv_trl.scenes import list_tasks, panda
 
 SIZE, C = 16, 4
 FK = ForwardKinematics()
@@ -324,3 +325,30 @@ def test_unusable_settings_are_refused():
     with pytest.raises(ValueError, match="missing"):
         env = make_env(1, 1)
         env.reset(given(env, [[0]]).exclude(CONTEXT_ID), set_state=True)
+
+
+def test_physics_and_imagination_have_the_same_interface():
+    real = chunked(TabletopEnv(list_tasks("goal")[0], 6, image_size=SIZE, proprio="commanded", seed=0), C)
+    start = real.reset()
+    env = ImaginedEnv(CountingWorldModel(), FK, start, [2, 3], max_steps=C, chunk_length=C)
+
+    def leaves(spec):
+        entries = {key: spec[key] for key in spec.keys(True, True)}
+        return {key: (tuple(leaf.shape[len(spec.shape) :]), leaf.dtype) for key, leaf in entries.items()}
+
+    physics, imagination = leaves(real.observation_spec), leaves(env.observation_spec)
+    shared = set(physics) - {SUCCESS}
+    assert {key: imagination[key] for key in shared} == {key: physics[key] for key in shared}
+    assert set(imagination) - set(physics) == {FRAMES, STATES, KINEMATIC_STATES}
+    assert env.action_keys == real.action_keys == [CHUNK]  # MultiAction leaves its spec's chunk length open (-1)
+    assert env.full_action_spec[CHUNK].shape[-1] == real.full_action_spec[CHUNK].shape[-1] == 7
+    assert leaves(env.full_done_spec) == leaves(real.full_done_spec)
+    assert leaves(env.full_reward_spec) == leaves(real.full_reward_spec)
+    # The same actions move the commanded state the same way.
+    replay = env.reset(start.reshape(2, 3), set_state=True)
+    chunk = 0.3 * torch.rand(6, C, 7, generator=torch.Generator().manual_seed(0))
+    after = real.step(start.set(CHUNK, chunk))["next"]
+    imagined = env.step(replay.set(CHUNK, chunk.view(2, 3, C, 7)))["next"]
+    columns = [0, 1, 2, 6]
+    assert torch.allclose(imagined[STATE].flatten(0, 1)[:, columns], after[STATE][:, columns], atol=1e-5)
+    real.close()
