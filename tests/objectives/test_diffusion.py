@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from worldenv_trl.keys import FRAMES, TASK_ID
 from worldenv_trl.objectives.diffusion import DiffusionLoss
 from worldenv_trl.world_models import VideoWorldModel, VideoWorldModelConfig
+from worldenv_trl.world_models.denoiser import from_cells
 
 CAMERA = SimpleNamespace(
     position=(1.2, 0.0, 0.8),
@@ -55,6 +56,11 @@ def first_chunk(td: TensorDict) -> TensorDict:
     return td
 
 
+def predict(model: VideoWorldModel, td: TensorDict) -> torch.Tensor:
+    """The deterministic prediction as images [B, C, 3, H, W] in [-1, 1]."""
+    return from_cells(model.predict(None, torch.zeros(td.shape[0]), model.conditions(td)), model.config.patch)
+
+
 def slow_loss(predicted, td, memory_last, l1_weight, moving_weight, threshold):
     """Numerator and denominator, pixel by pixel of one chunk, from the docstring."""
     target = td["target_frames"].double()
@@ -77,7 +83,7 @@ def slow_loss(predicted, td, memory_last, l1_weight, moving_weight, threshold):
 def test_the_loss_equals_a_plain_loop_over_pixels():
     model, td = make_model(), first_chunk(make_windows())
     td["target_mask"][0, 5:] = False
-    predicted = model.predict(torch.zeros(2, 8, 3, 32, 32), torch.zeros(2), model.conditions(td))
+    predicted = predict(model, td)
     numerator, denominator = slow_loss(predicted, td, td["memory", "frames"][:, -1], 0.3, 2.0, 0.05)
     loss = DiffusionLoss(model, l1_weight=0.3, moving_weight=2.0)
     assert loss(td)["loss_diffusion"].item() == pytest.approx(numerator / denominator, rel=1e-4)
@@ -92,17 +98,8 @@ def test_the_second_chunk_remembers_real_frames_or_what_the_model_painted(unroll
     painted = td["target_frames"][:, :8] if unroll_prob == 0 else model(head.clone())[FRAMES]
     tail["memory", "frames"] = model.next_memory(td["memory", "frames"], painted)
     tail["memory", "poses"] = model.next_memory(td["memory", "poses"], head["poses"])
-    zero, level = torch.zeros(2, 8, 3, 32, 32), torch.zeros(2)
-    parts = [
-        slow_loss(
-            model.predict(zero, level, model.conditions(part)), part, td["memory", "frames"][:, -1], 0.15, 4.0, 0.05
-        )
-        if part is head
-        else slow_loss(
-            model.predict(zero, level, model.conditions(part)), part, td["target_frames"][:, 7], 0.15, 4.0, 0.05
-        )
-        for part in (head, tail)
-    ]
+    last = {id(head): td["memory", "frames"][:, -1], id(tail): td["target_frames"][:, 7]}
+    parts = [slow_loss(predict(model, part), part, last[id(part)], 0.15, 4.0, 0.05) for part in (head, tail)]
     expected = sum(part[0] for part in parts) / sum(part[1] for part in parts)
     loss = DiffusionLoss(model, unroll_prob=unroll_prob)(td)["loss_diffusion"]
     assert loss.item() == pytest.approx(expected, rel=1e-4)

@@ -8,6 +8,7 @@ from tensordict import TensorDict
 
 from worldenv_trl.keys import FRAMES, TASK_ID
 from worldenv_trl.world_models import VideoWorldModel, VideoWorldModelConfig
+from worldenv_trl.world_models.denoiser import from_cells, to_cells
 
 # Looks at the origin from 1.2 m in front of the robot and 0.8 m above the table.
 CAMERA = SimpleNamespace(
@@ -102,9 +103,18 @@ def test_an_untrained_model_copies_the_last_frame():
 def test_a_pixel_at_the_tool_can_follow_the_tool_exactly():
     model = VideoWorldModel(VideoWorldModelConfig.for_cameras({3: CAMERA}, **SMALL))
     image = torch.rand(1, 3, 32, 32)
-    shift = torch.tensor([3.0, -2.0]).view(1, 1, 1, 1, 2)
-    moved = model.denoiser._move(image, shift)[0, 0]
+    shift = torch.tensor([3.0, -2.0]).view(1, 1, 1, 1, 1, 2)
+    moved = from_cells(model.denoiser._move(image, shift), 2)[0, 0]
     assert torch.allclose(moved[:, 4:26, 8:28], image[0, :, 6:28, 5:25], atol=1e-5)
+
+
+@pytest.mark.parametrize("patch", [1, 2, 4])
+def test_cells_hold_the_pixels_of_a_patch_and_are_undone(patch):
+    images = torch.randint(0, 256, (2, 3, 16, 16), dtype=torch.uint8)
+    cells = to_cells(images, patch)
+    expected = torch.nn.functional.pixel_unshuffle(images.float(), patch).unflatten(1, (3, -1))
+    assert torch.equal(cells.float(), expected)
+    assert torch.equal(from_cells(cells, patch), images)
 
 
 def test_memory_holds_the_first_frame_one_stride_back_and_the_last(model):

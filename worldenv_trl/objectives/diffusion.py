@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from worldenv_trl.keys import TASK_ID
+from worldenv_trl.world_models.denoiser import from_cells, to_cells
 from worldenv_trl.world_models.flow_matching import add_noise
 from worldenv_trl.world_models.video_world_model import (
     MEMORY_FRAMES,
@@ -116,7 +117,8 @@ class DiffusionLoss(LossModule):
             raise ValueError(f"target_frames must hold whole chunks of {length} frames, got {targets.shape[1]}")
         noised = torch.rand(targets.shape[0], device=targets.device) < self.noise_prob
         memory = real_memory = tensordict[MEMORY_FRAMES]
-        memory_poses = tensordict[MEMORY_POSES]
+        memory_poses, patch = tensordict[MEMORY_POSES], model.config.patch
+        reference = to_cells(tensordict[REFERENCE], patch)
         total = weight = 0.0
         sums = torch.zeros(4, device=targets.device)
         for start in range(0, targets.shape[1], length):
@@ -131,28 +133,31 @@ class DiffusionLoss(LossModule):
                 },
                 batch_size=targets.shape[:1],
             )
-            clean = to_float(chunk)
+            cells = to_cells(chunk, patch)  # [B, C, 3, P, h, w], the model's layout
+            clean = to_float(cells)
             level = torch.rand(targets.shape[0], device=targets.device) * noised
-            noisy = add_noise(clean, torch.randn_like(clean), level) if self.noise_prob else torch.zeros_like(clean)
-            noisy = noisy * noised.view(-1, 1, 1, 1, 1)
+            noisy = None
+            if self.noise_prob:
+                noisy = add_noise(clean, torch.randn_like(clean), level) * noised.view(-1, 1, 1, 1, 1, 1)
             predicted = model.predict(noisy, level, model.conditions(inputs))
 
-            moving = self._moving(chunk, tensordict[REFERENCE], real_memory[:, -1])  # [B, C, 1, H, W]
-            pixel_weight = (1 + self.moving_weight * moving) * valid.view(*valid.shape, 1, 1, 1)
+            moving = self._moving(cells, reference, to_cells(real_memory[:, -1], patch))  # [B, C, 1, P, h, w]
+            pixel_weight = (1 + self.moving_weight * moving) * valid.view(*valid.shape, 1, 1, 1, 1)
             error = predicted - clean
-            cost = error.square() + self.l1_weight * error.abs()
-            total = total + (cost * pixel_weight).sum() / cost.shape[2]
+            absolute = error.abs()
+            total = total + (absolute * (absolute + self.l1_weight) * pixel_weight).sum() / 3
             weight = weight + pixel_weight.sum()
             with torch.no_grad():
                 sums += self._squares(error, moving, valid & ~noised.unsqueeze(-1))
 
-            real_memory = model.next_memory(real_memory, chunk)
-            own_memory = model.next_memory(memory, to_uint8(predicted.detach()))
-            own = torch.rand(targets.shape[0], device=targets.device) < self.unroll_prob
-            # A prediction from an almost clean chunk is not what the model would imagine.
-            own = own & (level < 0.5)
-            memory = torch.where(own.view(-1, 1, 1, 1, 1), own_memory, real_memory)
-            memory_poses = model.next_memory(memory_poses, inputs[POSES])
+            if start + length < targets.shape[1]:
+                real_memory = model.next_memory(real_memory, chunk)
+                own_memory = model.next_memory(memory, _painted(predicted, patch))
+                own = torch.rand(targets.shape[0], device=targets.device) < self.unroll_prob
+                # A prediction from an almost clean chunk is not what the model would imagine.
+                own = own & (level < 0.5)
+                memory = torch.where(own.view(-1, 1, 1, 1, 1), own_memory, real_memory)
+                memory_poses = model.next_memory(memory_poses, inputs[POSES])
         return TensorDict(
             {
                 "loss_diffusion": total / weight.clamp(min=1.0),
@@ -162,18 +167,21 @@ class DiffusionLoss(LossModule):
         )
 
     def _moving(self, chunk: Tensor, reference: Tensor, last: Tensor) -> Tensor:
-        """1 where a pixel of the chunk differs from the reference or the last frame before it: [B, C, 1, H, W]."""
-        chunk = chunk.short()
-        change = torch.maximum(
-            (chunk - reference.unsqueeze(1)).abs().amax(2, keepdim=True),
-            (chunk - last.unsqueeze(1)).abs().amax(2, keepdim=True),
-        )
-        return (change > 255 * self.moving_threshold).float()
+        """1 where a pixel of the chunk differs from the reference or the last frame before it: [B, C, 1, P, h, w]."""
+        chunk, threshold = chunk.short(), int(255 * self.moving_threshold)
+        changed = (chunk - reference.short().unsqueeze(1)).abs() > threshold
+        changed |= (chunk - last.short().unsqueeze(1)).abs() > threshold
+        return changed.any(2, keepdim=True).float()
 
     @staticmethod
     def _squares(error: Tensor, moving: Tensor, valid: Tensor) -> Tensor:
         """Squared error in [0, 1] units and pixel count, of all pixels and of moving ones: [4]."""
         square = error.square().mean(2, keepdim=True) / 4
-        valid = valid.view(*valid.shape, 1, 1, 1).float().expand_as(square)
+        valid = valid.view(*valid.shape, 1, 1, 1, 1).float().expand_as(square)
         moving = moving * valid
         return torch.stack([(square * valid).sum(), valid.sum(), (square * moving).sum(), moving.sum()])
+
+
+def _painted(cells: Tensor, patch: int) -> Tensor:
+    """The frames that a prediction shows, as imagination would store them: uint8 [B, C, 3, H, W]."""
+    return from_cells(to_uint8(cells.detach()), patch)

@@ -6,9 +6,21 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-__all__ = ["Denoiser"]
+__all__ = ["Denoiser", "from_cells", "to_cells"]
 
 _CANDIDATES = 4  # last frame, first frame, moved last frame, painted
+
+
+def to_cells(images: Tensor, patch: int) -> Tensor:
+    """[*B, H, W] -> [*B, patch^2, H / patch, W / patch]: the pixels of a cell side by side, row by row."""
+    cells = images.unflatten(-1, (-1, patch)).unflatten(-3, (-1, patch))  # [*B, h, p, w, p]
+    return cells.movedim((-3, -1), (-4, -3)).contiguous().flatten(-4, -3)
+
+
+def from_cells(cells: Tensor, patch: int) -> Tensor:
+    """[*B, patch^2, h, w] -> [*B, h * patch, w * patch], the inverse of :func:`to_cells`."""
+    images = cells.unflatten(-3, (patch, patch)).movedim((-4, -3), (-3, -1))  # [*B, h, p, w, p]
+    return images.contiguous().flatten(-4, -3).flatten(-2, -1)
 
 
 class Denoiser(nn.Module):
@@ -23,6 +35,9 @@ class Denoiser(nn.Module):
     - the last frame moved along with the tool's motion on the image plus a predicted residual flow (the arm, and what
       it holds or pushes, stay sharp instead of being painted again in every chunk),
     - freely painted colour.
+
+    Chunks are handled as cells [B, C, 3, P, h, w], P = patch^2 (:func:`to_cells`), the layout of the finest grid:
+    nothing is reordered between network, composition and loss.
 
     Poses, actions, noise level and the reference frame's embedding modulate the residual blocks (FiLM).
 
@@ -67,7 +82,8 @@ class Denoiser(nn.Module):
         self.embed = nn.Sequential(nn.Linear(embedding_dim, embedding_dim), nn.SiLU())
 
         self.memory_in = nn.Conv2d(memory_frames * (cell + maps), width, 3, padding=1)
-        self.frame_in = nn.Conv2d(2 * cell + maps, frame_channels, 3, padding=1)
+        self.frame_in = nn.Conv2d(cell + maps, frame_channels, 3, padding=1)
+        self.noisy_in = nn.Conv2d(cell, frame_channels, 3, padding=1, bias=False)
         self.merge = nn.Conv2d(chunk_length * frame_channels, width, 1)
 
         self.down, self.shrink = nn.ModuleList(), nn.ModuleList()
@@ -82,18 +98,19 @@ class Denoiser(nn.Module):
         decoder = 3 * frame_channels // 2
         self.split = nn.Conv2d(width, chunk_length * decoder, 1)
         self.frame_out = nn.Conv2d(decoder + frame_channels, 2 * frame_channels, 3, padding=1)
-        self.paint = nn.Conv2d(2 * frame_channels, 2 + (_CANDIDATES + 3) * patch**2, 1)
+        self.paint = nn.Conv2d(2 * frame_channels, (_CANDIDATES + 3 + 2) * patch**2, 1)  # weights, colour, flow
         nn.init.zeros_(self.paint.weight)
         with torch.no_grad():
             self.paint.bias.zero_()
-            self.paint.bias[2 : 2 + patch**2] = 2.0  # starts as a copy of the last frame
+            self.paint.bias[: patch**2] = 2.0  # starts as a copy of the last frame
 
         axis = (torch.arange(image_size, dtype=torch.float32) + 0.5) * 2 / image_size - 1
-        self.register_buffer("_base", torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1), persistent=False)
+        base = torch.stack([to_cells(plane, patch) for plane in torch.meshgrid(axis, axis, indexing="xy")], -1)
+        self.register_buffer("_base", base, persistent=False)  # where every pixel is: [P, h, w, 2]
 
     def forward(
         self,
-        noisy: Tensor,
+        noisy: Tensor | None,
         noise_level: Tensor,
         memory: Tensor,
         memory_maps: Tensor,
@@ -105,7 +122,7 @@ class Denoiser(nn.Module):
         """Images are float in [-1, 1].
 
         Args:
-            noisy: [B, C, 3, H, W], the noisy chunk.
+            noisy: [B, C, 3, P, h, w], the noisy chunk, or None for zeros (which cost nothing).
             noise_level: [B], 0 is pure noise (or nothing known), 1 is clean.
             memory: [B, M, 3, H, W].
             memory_maps: [B, M, K + 2, h, w], action maps and tool coordinates of the remembered frames.
@@ -115,20 +132,25 @@ class Denoiser(nn.Module):
             reference: [B, 3, H, W].
 
         Returns:
-            x_0 float32 [B, C, 3, H, W].
+            x_0 float32 [B, C, 3, P, h, w].
         """
-        batch, chunk = noisy.shape[:2]
-        size = noisy.shape[-1]
-        last, first = memory[:, -1], memory[:, 0]
+        batch, chunk = motion.shape[:2]
         embedding = self.condition(condition) + self.reference(reference) + self.noise_level(noise_level.unsqueeze(-1))
         embedding = self.embed(embedding)
+        motion = motion.view(batch, chunk, 1, 1, 1, 2)
+        remembered = to_cells(memory, self.patch)  # [B, M, 3, P, h, w]
 
-        moved = self._move(last, motion.view(batch, chunk, 1, 1, 2))
-        per_frame = torch.cat([self._cells(moved), self._cells(noisy), maps.flatten(0, 1)], 1)
-        per_frame = F.silu(self.frame_in(per_frame.contiguous(memory_format=torch.channels_last)))
-        remembered = torch.cat([self._cells(memory).unflatten(0, (batch, -1)), memory_maps], 2).flatten(1, 2)
-        trunk = self.memory_in(remembered.contiguous(memory_format=torch.channels_last))
-        trunk = trunk + self.merge(per_frame.unflatten(0, (batch, chunk)).flatten(1, 2))
+        with torch.no_grad():
+            moved = self._move(memory[:, -1], motion).flatten(2, 3)
+            per_frame = torch.cat([moved, maps], 2).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+        per_frame = self.frame_in(per_frame)
+        if noisy is not None:
+            noisy = noisy.flatten(2, 3).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+            per_frame = per_frame + self.noisy_in(noisy)
+        per_frame = F.silu(per_frame)
+        inputs = torch.cat([remembered.flatten(2, 3), memory_maps], 2).flatten(1, 2)
+        trunk = self.memory_in(inputs.contiguous(memory_format=torch.channels_last))
+        trunk = trunk + self.merge(_frames_to_channels(per_frame, chunk))
 
         skips = []
         for level, blocks in enumerate(self.down):
@@ -142,36 +164,40 @@ class Denoiser(nn.Module):
             for block in self.up[level]:
                 trunk = block(trunk, embedding)
 
-        decoded = F.silu(self.split(trunk)).unflatten(1, (chunk, -1)).flatten(0, 1)
+        decoded = _channels_to_frames(F.silu(self.split(trunk)), chunk)
         decoded = F.silu(self.frame_out(torch.cat([decoded, per_frame], 1)))
-        painted = self.paint(decoded).float()  # [B C, 2 + 7 patch^2, h, w]
-        flow = F.interpolate(painted[:, :2], scale_factor=self.patch, mode="bilinear", align_corners=False)
-        flow = flow.view(batch, chunk, 2, size, size).permute(0, 1, 3, 4, 2)
-        dense = F.pixel_shuffle(painted[:, 2:].contiguous(), self.patch).view(batch, chunk, _CANDIDATES + 3, size, size)
-        weight = dense[:, :, :_CANDIDATES].softmax(2)
-        moved = self._move(last, motion.view(batch, chunk, 1, 1, 2) + flow)
-        return (
-            weight[:, :, 0:1] * last.unsqueeze(1)
-            + weight[:, :, 1:2] * first.unsqueeze(1)
-            + weight[:, :, 2:3] * moved
-            + weight[:, :, 3:4] * dense[:, :, _CANDIDATES:]
+        painted = (
+            self.paint(decoded).float().contiguous().unflatten(1, (-1, self.patch**2)).unflatten(0, (batch, chunk))
         )
-
-    def _cells(self, images: Tensor) -> Tensor:
-        """[B, N, 3, H, W] -> [B N, 3 patch^2, h, w]."""
-        return F.pixel_unshuffle(images.flatten(0, 1), self.patch)
+        weight = painted[:, :, :_CANDIDATES].softmax(2).unsqueeze(3)  # [B, C, 4, 1, P, h, w]
+        colour, flow = painted[:, :, _CANDIDATES : _CANDIDATES + 3], painted[:, :, _CANDIDATES + 3 :]
+        moved = self._move(memory[:, -1], motion + flow.movedim(2, -1))
+        chosen = weight[:, :, 0] * remembered[:, None, -1]
+        chosen = torch.addcmul(chosen, weight[:, :, 1], remembered[:, None, 0])
+        chosen = torch.addcmul(chosen, weight[:, :, 2], moved)
+        return torch.addcmul(chosen, weight[:, :, 3], colour)
 
     def _move(self, image: Tensor, motion: Tensor) -> Tensor:
-        """``image`` [B, 3, H, W] moved by pixels [B, C, H or 1, W or 1, 2]: [B, C, 3, H, W]."""
-        batch, chunk = motion.shape[:2]
-        size = image.shape[-1]
+        """``image`` [B, 3, H, W] moved by pixels [B, C, P or 1, h or 1, w or 1, 2]: cells [B, C, 3, P, h, w]."""
+        (batch, chunk), (cell, height, width, _) = motion.shape[:2], self._base.shape
         with torch.autocast(image.device.type, enabled=False):
-            grid = self._base - motion.float() * (2 / size)
-            # One call for the whole chunk: the frames are stacked along the height.
-            moved = F.grid_sample(
-                image, grid.reshape(batch, chunk * size, size, 2), padding_mode="border", align_corners=False
-            )
-        return moved.view(batch, 3, chunk, size, size).transpose(1, 2)
+            grid = torch.sub(self._base, motion.float(), alpha=2 / image.shape[-1])
+            # One call for the whole chunk, sampled in the order of the cells.
+            grid = grid.reshape(batch, chunk * cell * height, width, 2)
+            moved = F.grid_sample(image, grid, padding_mode="border", align_corners=False)
+        return moved.view(batch, 3, chunk, cell, height, width).transpose(1, 2)
+
+
+def _frames_to_channels(features: Tensor, chunk: int) -> Tensor:
+    """[B C, D, h, w] -> [B, C D, h, w], both channels_last."""
+    features = features.permute(0, 2, 3, 1).unflatten(0, (-1, chunk))  # [B, C, h, w, D]
+    return features.permute(0, 2, 3, 1, 4).flatten(3).permute(0, 3, 1, 2)
+
+
+def _channels_to_frames(features: Tensor, chunk: int) -> Tensor:
+    """The inverse of :func:`_frames_to_channels`."""
+    features = features.permute(0, 2, 3, 1).unflatten(3, (chunk, -1))  # [B, h, w, C, D]
+    return features.permute(0, 3, 1, 2, 4).flatten(0, 1).permute(0, 3, 1, 2)
 
 
 class _Block(nn.Module):
@@ -189,7 +215,7 @@ class _Block(nn.Module):
     def forward(self, features: Tensor, embedding: Tensor) -> Tensor:
         scale, shift = self.modulation(embedding)[..., None, None].chunk(2, 1)
         hidden = self.first(self.norm(features))
-        return features + self.second(F.silu(hidden * (1 + scale) + shift))
+        return features + self.second(F.silu(torch.addcmul(shift, hidden, 1 + scale)))
 
 
 class _ReferenceEncoder(nn.Module):

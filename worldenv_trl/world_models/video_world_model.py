@@ -15,7 +15,7 @@ from torch import Tensor
 from worldenv_trl.keys import CHUNK_LENGTH, FRAMES, POSE_DIM, TASK_ID
 from worldenv_trl.kinematics import ActionMap
 from worldenv_trl.pretrained import Pretrained
-from worldenv_trl.world_models.denoiser import Denoiser
+from worldenv_trl.world_models.denoiser import Denoiser, from_cells, to_cells
 from worldenv_trl.world_models.flow_matching import sample, seeded_noise
 
 __all__ = ["VideoWorldModel", "VideoWorldModelConfig"]
@@ -174,17 +174,16 @@ class VideoWorldModel(TensorDictModuleBase, Pretrained):
         return tensordict.set(FRAMES, torch.cat(parts))
 
     def _generate(self, tensordict: TensorDictBase) -> Tensor:
-        size, rows = self.config.image_size, tensordict.shape[0]
-        shape = (self.chunk_length, 3, size, size)
-        conditions = self.conditions(tensordict)
-        device = tensordict[POSES].device
+        size, rows, patch = self.config.image_size, tensordict.shape[0], self.config.patch
+        conditions, device = self.conditions(tensordict), tensordict[POSES].device
         if self.deterministic:
-            clean = self.predict(torch.zeros(rows, *shape, device=device), torch.zeros(rows, device=device), conditions)
+            clean = self.predict(None, torch.zeros(rows, device=device), conditions)
         else:
-            seed = tensordict.get(NOISE_SEED, None)
+            seed, shape = tensordict.get(NOISE_SEED, None), (self.chunk_length, 3, size, size)
             noise = torch.randn(rows, *shape, device=device) if seed is None else seeded_noise(seed, shape)
+            noise = to_cells(noise, patch)
             clean = sample(lambda x, level: self.predict(x, level, conditions), noise, self.num_denoise_steps)
-        return to_uint8(clean)
+        return to_uint8(from_cells(clean, patch))
 
     def conditions(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """What the denoiser knows besides the noisy chunk: its keyword arguments, computed once for all steps."""
@@ -204,9 +203,12 @@ class VideoWorldModel(TensorDictModuleBase, Pretrained):
             "reference": to_float(tensordict[REFERENCE]),
         }
 
-    def predict(self, noisy: Tensor, level: Tensor, conditions: dict[str, Tensor]) -> Tensor:
-        """x_0 float32 [B, C, 3, H, W] in [-1, 1] from the noisy chunk at noise level [B] (0: pure noise or zeros)."""
-        with torch.autocast(noisy.device.type, torch.bfloat16, enabled=self._bfloat16(noisy.device)):
+    def predict(self, noisy: Tensor | None, level: Tensor, conditions: dict[str, Tensor]) -> Tensor:
+        """x_0 from the noisy chunk (None: zeros) at noise level [B] (0: pure noise or zeros).
+
+        Both are float cells [B, C, 3, patch^2, h, w] of images in [-1, 1], see :func:`to_cells`.
+        """
+        with torch.autocast(level.device.type, torch.bfloat16, enabled=self._bfloat16(level.device)):
             return self.denoiser(noisy, level, **conditions)
 
     def _bfloat16(self, device: torch.device) -> bool:
