@@ -1,10 +1,9 @@
 """What the world is made of: robot, objects, tasks, predicates, simulation, expert. NumPy and MuJoCo only."""
 
-from worldenv_trl.scenes.rendering import RendererPool  # first: it chooses the GL backend before anything loads GL
-
-# isort: split
 from worldenv_trl.scenes.camera import Camera
+from worldenv_trl.scenes.expert import ScriptedExpert
+from worldenv_trl.scenes.rendering import RendererPool
 from worldenv_trl.scenes.simulation import SceneBatch
 from worldenv_trl.scenes.tasks import Task, list_suites, list_tasks, load_task
 
-__all__ = ["Camera", "RendererPool", "SceneBatch", "Task", "list_suites", "list_tasks", "load_task"]
+__all__ = ["Camera", "RendererPool", "SceneBatch", "ScriptedExpert", "Task", "list_suites", "list_tasks", "load_task"]

@@ -97,6 +97,18 @@ def vector_from_rotation(rotation: np.ndarray) -> np.ndarray:
     return vector
 
 
+def hand_axis_angle(rotation: np.ndarray) -> np.ndarray:
+    """Axis-angle ``[n, 3]`` (rad) of ``[n, 3, 3]``, continuous around a hand that points down.
+
+    The hand works near a half turn about x, where the usual choice (angle at most pi) flips its sign for nothing; here the
+    axis keeps a positive x component and the angle runs to 2 pi.
+    """
+    vector = vector_from_rotation(rotation)
+    angle = np.linalg.norm(vector, axis=-1, keepdims=True)
+    other = vector * (1 - 2 * math.pi / np.maximum(angle, 1e-12))
+    return np.where((vector[:, :1] < 0) & (angle > 1e-8), other, vector)
+
+
 def reset_targets(q: np.ndarray, opening: np.ndarray) -> np.ndarray:
     """Targets ``[n, 13]`` (x_des, R_des row-major, opening) that hold the arm where ``q`` puts it."""
     position, rotation, _ = forward_kinematics(q)

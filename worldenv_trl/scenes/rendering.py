@@ -6,15 +6,9 @@ import atexit
 import copy
 import os
 import queue
-import sys
 import threading
 import weakref
 from collections.abc import Callable, Sequence
-
-# A software rasteriser that starts threads of its own fights with ours; both must be set before GL is loaded.
-os.environ.setdefault("LP_NUM_THREADS", "0")
-if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-    os.environ.setdefault("MUJOCO_GL", "egl")
 
 import mujoco
 import numpy as np
@@ -22,7 +16,7 @@ import numpy as np
 Paint = Callable[[mujoco.MjModel, np.ndarray], None]
 _REMEDY = (
     "install Debian's libegl1, libgl1-mesa-dri and libosmesa6 (bash .ci/install does), "
-    "and set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
+    "and set MUJOCO_GL=egl or MUJOCO_GL=osmesa before Python starts"
 )
 
 
@@ -50,10 +44,17 @@ class RendererPool:
         paint: Paint | None = None,
     ) -> None:
         self.cameras, self.image_size = tuple(cameras), image_size
-        self._painters = [_Painter(model, image_size, paint) for _ in range(max(1, num_threads))]
-        errors = [error for error in (painter.wait() for painter in self._painters) if error is not None]
-        # A GL context is freed on the thread that made it. At exit this must come before MuJoCo ends EGL, whose own exit
-        # handler was registered when the first context was made: later ones run earlier.
+        self._painters: list[_Painter] = []
+        errors: list[Exception] = []
+        for _ in range(max(1, num_threads)):
+            painter = _Painter(model, image_size, paint)
+            self._painters.append(painter)
+            # One after another: GL loaders are not safe to run side by side.
+            if (error := painter.wait()) is not None:
+                errors.append(error)
+                break
+        # A GL context is freed on the thread that made it. At exit this must come before MuJoCo ends EGL, whose own
+        # exit handler was registered when the first context was made: later ones run earlier.
         self._close = weakref.finalize(self, _stop, self._painters)
         self._close.atexit = False
         atexit.register(self._close)
@@ -65,7 +66,8 @@ class RendererPool:
             ) from errors[0]
 
     def render(self, qpos: np.ndarray, mocap_pos: np.ndarray) -> dict[str, np.ndarray]:
-        """Draws rows ``qpos [n, nq]``, ``mocap_pos [n, nmocap, 3]``: for each camera ``[n, 3, H, W]`` uint8, upright."""
+        """Draws rows ``qpos [n, nq]``, ``mocap_pos [n, nmocap, 3]``: for each camera
+        ``[n, 3, H, W]`` uint8, upright."""
         size = self.image_size
         images = {name: np.empty((len(qpos), 3, size, size), np.uint8) for name in self.cameras}
         busy = self._painters[: len(qpos)]

@@ -116,13 +116,13 @@ class SceneBatch:
 
     def measured_state(self) -> np.ndarray:
         """Hand position (m), axis-angle (rad) and gripper opening as they are, ``[n, 7]`` float32."""
-        rotation = controller.vector_from_rotation(self.site_xmat[:, self._tcp].reshape(-1, 3, 3))
+        rotation = controller.hand_axis_angle(self.site_xmat[:, self._tcp].reshape(-1, 3, 3))
         opening = self.qpos[:, self._finger, None] / panda.FINGER_TRAVEL
         return np.concatenate([self.site_xpos[:, self._tcp], rotation, np.clip(opening, 0, 1)], -1).astype(np.float32)
 
     def commanded_state(self) -> np.ndarray:
         """Target position (m), axis-angle (rad) and gripper opening, ``[n, 7]`` float32."""
-        rotation = controller.vector_from_rotation(self._targets[:, 3:12].reshape(-1, 3, 3))
+        rotation = controller.hand_axis_angle(self._targets[:, 3:12].reshape(-1, 3, 3))
         return np.concatenate([self._targets[:, :3], rotation, self._targets[:, 12:]], -1).astype(np.float32)
 
     def kinematic_state(self) -> np.ndarray:

@@ -1,0 +1,160 @@
+"""Settings of every stage, and the two presets. ``python recipes/world_env.py smoke --help`` lists them all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+GOAL_TASKS = (
+    "goal/put_the_bowl_on_the_plate",
+    "goal/open_the_top_drawer",
+    "goal/turn_on_the_stove",
+)
+
+
+@dataclass(frozen=True)
+class Demonstrate:
+    """Scripted-expert demonstrations: the only supervised data."""
+
+    episodes_per_task: int = 5
+    """Demonstrations per task, from the first training initial states."""
+
+
+@dataclass(frozen=True)
+class SFT:
+    """Supervised fine-tuning: L1 on the action chunk, then the Laplace scale head alone (World-Env Eq. 8)."""
+
+    steps: int = 2000
+    batch_size: int = 64
+    lr: float = 1e-3
+    weight_decay: float = 1e-4
+    shift_px: int = 2
+    """Random image shift, the augmentation that helps with five demonstrations."""
+    dim: int = 128
+    depth: int = 3
+    scale_steps: int = 200
+    scale_lr: float = 1e-3
+
+
+@dataclass(frozen=True)
+class Explore:
+    """The policy's own rollouts in the scenes, at several multiples of its trained scale: data for both models."""
+
+    episodes_per_task: int = 320
+    scale_factors: tuple[float, ...] = (0.0, 1.0, 1.5, 2.5)
+    """Multiples of the trained Laplace scale; the episodes are shared out equally. 0 is the greedy policy."""
+    num_envs: int = 32
+
+
+@dataclass(frozen=True)
+class WorldModel:
+    """Video world model training on demonstrations and exploration."""
+
+    steps: int = 4000
+    refit_steps: int = 1500
+    """Steps of the later rounds, which continue from the model of the round before."""
+    batch_size: int = 16
+    lr: float = 6e-4
+    weight_decay: float = 1e-3
+    unroll_prob: float = 0.5
+    """Share of updates in which the second chunk is generated from the model's own first chunk."""
+    denoise_steps: int = 1
+    deterministic: bool = True
+    """One step from zero noise; set to False to sample with ``denoise_steps`` steps."""
+    holdout: float = 0.08
+    """Share of exploration episodes kept out for the fidelity figures (by initial state)."""
+
+
+@dataclass(frozen=True)
+class Reflector:
+    """Instant reflector: frozen encoder, trained reward head."""
+
+    encoder_steps: int = 600
+    steps: int = 1000
+    batch_size: int = 32
+    lr: float = 1e-3
+    imagined_share: float = 0.5
+    """Share of the training episodes that are imagined replays of recorded actions, labelled by the physics."""
+    threshold: float = 0.5
+    consecutive: int = 1
+    choose_threshold: bool = False
+    """Choose threshold and consecutive frames on held-out training rollouts instead of the two settings above."""
+
+
+@dataclass(frozen=True)
+class PostTrain:
+    """LOOP (World-Env Algorithm 1)."""
+
+    env: str = "imagined"
+    """``imagined`` (the world model) or ``tabletop`` (the physics: the upper bound; same recipe otherwise)."""
+    iterations: int = 20
+    groups: int = 24
+    group_size: int = 8
+    epochs: int = 4
+    minibatch_size: int = 256
+    clip_epsilon: float = 0.1
+    ratio_level: str = "step"
+    lora_rank: int = 16
+    lora_lr: float = 1e-4
+    head_lr: float = 3e-4
+    scale_factor: float = 1.5
+    """Behaviour and scored density use this multiple of the trained scale."""
+    warmup_iterations: int = 2
+    max_kl: float = 0.1
+    """An iteration's updates stop when the approximate KL per step exceeds this."""
+    max_grad_norm: float = 1.0
+    standardize: bool = True
+    """Divide the advantages of a batch by their overall standard deviation (World-Env does not)."""
+    probe_every: int = 5
+    """Iterations between greedy probes on training contexts in the physics (logged, never learned from); 0 is never."""
+    probe_contexts: int = 50
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Greedy success on held-out initial states, both protocols, before and after."""
+
+    episodes_per_task: int = 200
+    num_envs: int = 50
+
+
+@dataclass(frozen=True)
+class WorldEnvConfig:
+    """The whole loop: demonstrations -> SFT -> exploration -> world model -> reflector -> LOOP -> evaluation."""
+
+    run_dir: Path = Path("runs/world_env")
+    seed: int = 0
+    num_threads: int = 2
+    tasks: tuple[str, ...] = GOAL_TASKS
+    image_size: int = 64
+    chunk_length: int = 8
+    max_steps: int = 64
+    rounds: int = 1
+    """Times that exploration, both models and LOOP run in turn, each with the policy reached so far."""
+    demonstrate: Demonstrate = field(default_factory=Demonstrate)
+    sft: SFT = field(default_factory=SFT)
+    explore: Explore = field(default_factory=Explore)
+    world_model: WorldModel = field(default_factory=WorldModel)
+    reflector: Reflector = field(default_factory=Reflector)
+    post_train: PostTrain = field(default_factory=PostTrain)
+    evaluate: Evaluate = field(default_factory=Evaluate)
+
+
+PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
+    "smoke": (
+        "Every stage for real in at most 6 minutes on 2 cores; too short to improve anything.",
+        WorldEnvConfig(
+            run_dir=Path("runs/smoke"),
+            sft=SFT(steps=250, scale_steps=40),
+            explore=Explore(episodes_per_task=24, num_envs=24),
+            world_model=WorldModel(steps=220),
+            reflector=Reflector(encoder_steps=60, steps=80),
+            post_train=PostTrain(iterations=2, groups=6, probe_every=1, probe_contexts=10),
+            evaluate=Evaluate(episodes_per_task=20, num_envs=20),
+        ),
+    ),
+    "improve": (
+        "Post-training that raises held-out success; at most 60 minutes on 2 cores.",
+        WorldEnvConfig(run_dir=Path("runs/improve"), reflector=Reflector(choose_threshold=True)),
+    ),
+}

@@ -1,0 +1,48 @@
+"""Scripted-expert demonstrations from the first training initial states.
+
+Alone: ``python recipes/demonstrate.py improve --run-dir runs/improve``.
+"""
+
+from __future__ import annotations
+
+from config import WorldEnvConfig
+from parts import expert_policy, seed_everything, step_env
+from run_folder import RunFolder
+from tqdm import tqdm
+
+from worldenv_trl import keys
+from worldenv_trl.collectors import GroupCollector
+from worldenv_trl.record import RolloutWriter
+
+
+def run(config: WorldEnvConfig, folder: RunFolder) -> None:
+    """Writes ``rollouts/demonstrations.mcap``; raises ``RuntimeError`` if the expert fails one."""
+    seed_everything(config, offset=0)
+    count = config.demonstrate.episodes_per_task
+    metadata = {"stage": "demonstrate", "tasks": list(config.tasks), "seed": config.seed}
+    with RolloutWriter(folder.rollouts("demonstrations"), metadata=metadata, overwrite=True) as writer:
+        for task in tqdm(config.tasks, desc="demonstrate", unit="task"):
+            env = step_env(config, "train", count, tasks=[task], init_state_mode="cycle", terminate_on_success=True)
+            collector = GroupCollector(
+                env,
+                expert_policy(env),
+                groups_per_batch=count,
+                group_size=1,
+                total_groups=count,
+                max_decisions=config.max_steps,
+            )
+            rollouts = next(iter(collector))[:, 0]
+            collector.shutdown()
+            solved = (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1)
+            if not solved.all():
+                raise RuntimeError(f"the expert solved {int(solved.sum())} of {count} demonstrations of {task}")
+            writer.write(rollouts)
+            folder.log(
+                "demonstrate", task=task, episodes=count, steps=rollouts[keys.MASK].sum(-1).float().mean().item()
+            )
+
+
+if __name__ == "__main__":
+    from world_env import run_single
+
+    run_single("demonstrate")

@@ -1,0 +1,74 @@
+"""Greedy success on held-out initial states, before and after post-training, in both protocols.
+
+``physics``: the goal predicate ends the episode. ``reflector``: only the reflector (or the step limit) ends it, and the
+episode counts as a success if the goal holds in that moment (World-Env Table 3).
+Alone: ``python recipes/evaluate.py improve --run-dir runs/improve``.
+"""
+
+from __future__ import annotations
+
+import torch
+from config import WorldEnvConfig
+from parts import load_policy, load_reflector, physics_outcomes, seed_everything
+from run_folder import RunFolder
+
+from worldenv_trl.metrics import paired_test, wilson_interval
+from worldenv_trl.policies import laplace_actor
+from worldenv_trl.record import RolloutWriter
+
+
+def run(config: WorldEnvConfig, folder: RunFolder, before: str, after: str, models: str) -> None:
+    """Evaluates checkpoints ``before`` and ``after`` on the same held-out initial states."""
+    seed_everything(config, offset=90)
+    reflector = load_reflector(folder, models)
+    for protocol in ("physics", "reflector"):
+        outcomes: dict[str, dict[str, torch.Tensor]] = {}
+        for name in (before, after):
+            actor = laplace_actor(load_policy(folder, name, "post_train"))
+            metadata = {"stage": "evaluate", "policy": name, "protocol": protocol, "tasks": list(config.tasks)}
+            with RolloutWriter(
+                folder.rollouts(f"evaluate_{protocol}_{name}"), metadata=metadata, overwrite=True
+            ) as writer:
+                outcomes[name] = {
+                    task: physics_outcomes(
+                        config,
+                        actor,
+                        task,
+                        "test",
+                        config.evaluate.episodes_per_task,
+                        reflector=reflector if protocol == "reflector" else None,
+                        writer=writer,
+                        label=f"{name}, {protocol} stops",
+                    )
+                    for task in config.tasks
+                }
+        for name, per_task in outcomes.items():
+            _log(folder, protocol, name, "all", torch.cat(list(per_task.values())))
+            for task, success in per_task.items():
+                _log(folder, protocol, name, task, success)
+        for task in ("all", *config.tasks):
+            pair = [
+                torch.cat(list(o.values())) if task == "all" else o[task] for o in (outcomes[before], outcomes[after])
+            ]
+            test = paired_test(*pair)
+            folder.log("evaluate", protocol=protocol, task=task, paired=True, **{k: float(v) for k, v in test.items()})
+
+
+def _log(folder: RunFolder, protocol: str, policy: str, task: str, success: torch.Tensor) -> None:
+    low, high = wilson_interval(int(success.sum()), len(success))
+    folder.log(
+        "evaluate",
+        protocol=protocol,
+        policy=policy,
+        task=task,
+        success=success.float().mean().item(),
+        low=float(low),
+        high=float(high),
+        episodes=len(success),
+    )
+
+
+if __name__ == "__main__":
+    from world_env import run_single
+
+    run_single("evaluate")

@@ -1,0 +1,63 @@
+"""The policy's own rollouts in the scenes at several multiples of its trained scale, labelled by the physics.
+
+Alone: ``python recipes/explore.py improve --run-dir runs/improve``.
+"""
+
+from __future__ import annotations
+
+from config import WorldEnvConfig
+from parts import chunk_player, load_policy, seed_everything, step_env
+from run_folder import RunFolder
+from tqdm import tqdm
+
+from worldenv_trl import keys
+from worldenv_trl.collectors import GroupCollector
+from worldenv_trl.policies import laplace_actor
+from worldenv_trl.record import RolloutWriter
+
+
+def run(config: WorldEnvConfig, folder: RunFolder, policy: str = "sft", target: str = "explore") -> None:
+    """Rolls checkpoint ``policy`` on the training initial states; writes ``rollouts/<target>.mcap``."""
+    settings = config.explore
+    seed_everything(config, offset=20 + len(target))
+    model = load_policy(folder, policy, "sft").eval()
+    per_scale = -(-settings.episodes_per_task * len(config.tasks) // len(settings.scale_factors))
+    waves = -(-per_scale // settings.num_envs)
+    metadata = {"stage": target, "tasks": list(config.tasks), "seed": config.seed, "policy": policy}
+    with RolloutWriter(folder.rollouts(target), metadata=metadata, overwrite=True) as writer:
+        for number, factor in enumerate(settings.scale_factors):
+            # After success the rollout goes on: the models must see what undoes it (World-Env Figure 6).
+            env = step_env(
+                config,
+                "train",
+                settings.num_envs,
+                init_state_mode="random",
+                terminate_on_success=False,
+                seed=config.seed + 1000 * number + 17 * len(target),
+            )
+            player = chunk_player(laplace_actor(model, scale_factor=max(factor, 1e-6)), config.chunk_length)
+            collector = GroupCollector(
+                env,
+                player,
+                groups_per_batch=settings.num_envs,
+                group_size=1,
+                total_groups=waves * settings.num_envs,
+                max_decisions=config.max_steps,
+            )
+            reached = []
+            for wave in tqdm(collector, total=waves, desc=f"{target} scale x{factor:g}", unit="wave"):
+                rollouts = wave[:, 0]
+                writer.write(rollouts)
+                reached.append(
+                    (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1).float().mean().item()
+                )
+            collector.shutdown()
+            folder.log(
+                target, scale_factor=factor, episodes=waves * settings.num_envs, success=sum(reached) / len(reached)
+            )
+
+
+if __name__ == "__main__":
+    from world_env import run_single
+
+    run_single("explore")

@@ -1,0 +1,141 @@
+"""Builds and loads the parts that the stages compose: environments, policies, models."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from config import WorldEnvConfig
+from run_folder import RunFolder
+from tensordict import TensorDict
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import InitTracker, TransformedEnv
+from torchrl.modules import MultiStepActorWrapper
+
+from worldenv_trl import keys
+from worldenv_trl.data import concatenate_episodes, episodes_from_rollouts
+from worldenv_trl.envs import ImaginedEnv, Reflect, TabletopEnv, chunked
+from worldenv_trl.kinematics import ForwardKinematics
+from worldenv_trl.policies import OFTPolicy
+from worldenv_trl.record import read_rollouts
+from worldenv_trl.reflectors import CompactReflector
+from worldenv_trl.scenes import load_task
+from worldenv_trl.world_models import VideoWorldModel
+
+PROPRIO = "commanded"  # the same in physics and imagination, so the policy meets no gap between them
+
+
+def check_config(config: WorldEnvConfig) -> None:
+    """Fails before any long work starts if a task is unknown, a setting impossible or no GL backend renders."""
+    if not config.tasks:
+        raise ValueError("tasks is empty: name at least one task, for instance goal/open_the_top_drawer")
+    if config.post_train.env not in ("imagined", "tabletop"):
+        raise ValueError(f"post_train.env must be 'imagined' or 'tabletop', got {config.post_train.env!r}")
+    if config.max_steps % config.chunk_length:
+        raise ValueError(f"max_steps must be a multiple of chunk_length={config.chunk_length}, got {config.max_steps}")
+    for task in config.tasks:
+        load_task(task)
+    step_env(config, "train", 1, tasks=config.tasks[:1]).close()
+
+
+def seed_everything(config: WorldEnvConfig, offset: int) -> None:
+    """Each stage has its own stream, so a stage run alone draws the same numbers as in the whole loop."""
+    torch.manual_seed(1000 * config.seed + offset)
+
+
+def task_instructions(config: WorldEnvConfig) -> dict[int, str]:
+    return {task.task_id: task.language for task in map(load_task, config.tasks)}
+
+
+def step_env(
+    config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[str] | None = None, **options
+) -> TransformedEnv:
+    """Physics, one action a step (every frame is seen), with the ``is_init`` that :func:`chunk_player` needs."""
+    return TransformedEnv(_tabletop(config, split, num_envs, tasks, **options), InitTracker())
+
+
+def physics_waves_env(config: WorldEnvConfig, groups: int, group_size: int) -> EnvBase:
+    """Physics, one chunk a step, rows in groups that share an initial state: LOOP's upper bound."""
+    return chunked(
+        _tabletop(config, "train", groups * group_size, None, init_state_mode="random", group_repeats=group_size),
+        config.chunk_length,
+    )
+
+
+def _tabletop(config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[str] | None, **options) -> TabletopEnv:
+    tasks = list(config.tasks if tasks is None else tasks)
+    options = {"seed": config.seed, "num_threads": config.num_threads, "proprio": PROPRIO} | options
+    return TabletopEnv(
+        tasks if len(tasks) > 1 else tasks[0],
+        num_envs=num_envs,
+        image_size=config.image_size,
+        init_split=split,
+        max_steps=config.max_steps,
+        **options,
+    )
+
+
+def imagined_env(
+    config: WorldEnvConfig,
+    world_model: VideoWorldModel,
+    reflector: CompactReflector,
+    contexts: TensorDict,
+    batch_size: Sequence[int],
+) -> TransformedEnv:
+    """Imagination: FK, action map, world model; the reflector gives the reward and stops."""
+    env = ImaginedEnv(
+        world_model,
+        ForwardKinematics(),
+        contexts,
+        batch_size=list(batch_size),
+        max_steps=config.max_steps,
+        chunk_length=config.chunk_length,
+        proprio=PROPRIO,
+        seed=config.seed,
+    )
+    return TransformedEnv(env, reflect(reflector))
+
+
+def reflect(reflector: CompactReflector) -> Reflect:
+    """The stopping rule that was chosen when the reflector was trained is stored with it."""
+    return Reflect(reflector, threshold=reflector.config.threshold, consecutive=reflector.config.consecutive)
+
+
+def chunk_player(actor, chunk_length: int) -> MultiStepActorWrapper:
+    """Plays the actor's chunks open loop, one action a step. Its log-probs are stale: never train on them."""
+    return MultiStepActorWrapper(actor, n_steps=chunk_length)
+
+
+def load_policy(folder: RunFolder, name: str, stage: str) -> OFTPolicy:
+    return OFTPolicy.from_pretrained(folder.require_checkpoint(name, stage))
+
+
+def load_world_model(folder: RunFolder, suffix: str) -> VideoWorldModel:
+    model = VideoWorldModel.from_pretrained(folder.require_checkpoint(f"world_model{suffix}", "train_world_model"))
+    return model.eval()
+
+
+def load_reflector(folder: RunFolder, suffix: str) -> CompactReflector:
+    model = CompactReflector.from_pretrained(folder.require_checkpoint(f"reflector{suffix}", "train_reflector"))
+    return model.eval().requires_grad_(False)
+
+
+def read_episodes(folder: RunFolder, rounds: int) -> tuple[TensorDict, TensorDict]:
+    """Demonstrations, and the exploration of the first ``rounds`` rounds, as episodes."""
+    demonstrations = folder.require_rollouts("demonstrations", "demonstrate")
+    names = ["explore" + ("" if number == 1 else f"_{number}") for number in range(1, rounds + 1)]
+    explored = [folder.require_rollouts(name, "explore") for name in names]
+    return (
+        episodes_from_rollouts(read_rollouts(demonstrations)),
+        concatenate_episodes([episodes_from_rollouts(read_rollouts(path)) for path in explored]),
+    )
+
+
+def read_contexts(folder: RunFolder) -> TensorDict:
+    """The distinct training contexts (g, o_1, s_1) among the logged exploration rollouts; no simulator is touched."""
+    first = read_rollouts(folder.require_rollouts("explore", "explore"))[:, 0]
+    ids = first[keys.CONTEXT_ID].squeeze(-1)
+    rows = [int((ids == value).nonzero()[0, 0]) for value in ids.unique()]
+    return first[rows].select(
+        keys.IMAGE, keys.STATE, keys.KINEMATIC_STATE, keys.INSTRUCTION, keys.TASK_ID, keys.CONTEXT_ID
+    )

@@ -1,0 +1,158 @@
+"""LOOP (World-Env Algorithm 1): rollouts, leave-one-out advantages, clipped updates of LoRA and heads.
+
+``env="imagined"`` learns in the world model, ``env="tabletop"`` in the physics (the upper bound); nothing else changes.
+Alone: ``python recipes/post_train.py improve --run-dir runs/improve``.
+"""
+
+from __future__ import annotations
+
+import torch
+from config import WorldEnvConfig
+from parts import (
+    greedy_outcomes,
+    imagined_env,
+    load_policy,
+    load_reflector,
+    load_world_model,
+    physics_waves_env,
+    read_contexts,
+    seed_everything,
+)
+from run_folder import RunFolder
+from tqdm import tqdm
+
+from worldenv_trl import keys
+from worldenv_trl.collectors import GroupCollector
+from worldenv_trl.metrics import honesty
+from worldenv_trl.objectives import LOOPLoss, rloo_advantage
+from worldenv_trl.policies import laplace_actor
+from worldenv_trl.record import RolloutWriter
+
+
+def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, models: str) -> None:
+    """Improves checkpoint ``source`` in the world model and reflector of round ``models``; writes ``target``."""
+    settings = config.post_train
+    seed_everything(config, offset=50)
+    policy = load_policy(folder, source, "sft")
+    if not policy.has_lora:
+        policy.add_lora(settings.lora_rank)
+    actor = laplace_actor(policy, scale_factor=settings.scale_factor)
+
+    contexts = read_contexts(folder)
+    world_model, reflector = load_world_model(folder, models), load_reflector(folder, models)
+    shape = [settings.groups, settings.group_size]
+    if settings.env == "imagined":
+        env = imagined_env(config, world_model, reflector, contexts, shape)
+    else:
+        env = physics_waves_env(config, *shape)
+    collector = GroupCollector(
+        env,
+        actor,
+        groups_per_batch=settings.groups,
+        total_groups=settings.iterations * settings.groups,
+        group_size=settings.group_size,
+    )
+    loss = LOOPLoss(actor, clip_epsilon=settings.clip_epsilon, ratio_level=settings.ratio_level, functional=False)
+    heads = list(policy.head_parameters())
+    lora = [p for n, p in policy.named_parameters() if "lora_" in n and p.requires_grad]
+    optimizer = torch.optim.AdamW(
+        [{"params": lora, "lr": settings.lora_lr}, {"params": heads, "lr": settings.head_lr}], weight_decay=0.0
+    )
+    final_rates = [group["lr"] for group in optimizer.param_groups]
+
+    progress = tqdm(collector, total=settings.iterations, desc=target, unit="it")
+    for iteration, wave in enumerate(progress):
+        warmup = min(1.0, (iteration + 1) / (settings.warmup_iterations + 1))
+        for group, rate in zip(optimizer.param_groups, final_rates, strict=True):
+            group["lr"] = warmup * rate
+        returns = wave["returns"]  # [G, N]
+        advantage = rloo_advantage(returns)
+        if settings.standardize:
+            advantage = advantage / advantage.std().clamp_min(1e-6)
+        wave[keys.ADVANTAGE] = advantage[..., None, None].expand(*wave.shape, 1)
+        decisions = wave.select(
+            keys.IMAGE,
+            keys.STATE,
+            keys.TASK_ID,
+            keys.CHUNK,
+            keys.LOG_PROBS,
+            keys.ADVANTAGE,
+            ("next", keys.STEP_MASK),
+            keys.MASK,
+        )[wave[keys.MASK]]
+        decisions[keys.STEP_MASK] = decisions["next", keys.STEP_MASK]
+        decisions = decisions[decisions[keys.ADVANTAGE].squeeze(-1) != 0]  # groups without variance teach nothing
+        metrics = _update(decisions, loss, optimizer, [lora, heads], settings)
+        collector.update_policy_weights_()
+
+        metrics |= _wave_metrics(wave, returns)
+        if settings.probe_every and (iteration % settings.probe_every == 0 or iteration == settings.iterations - 1):
+            metrics |= _probe(config, actor, world_model, reflector, contexts)
+        folder.log(target, step=iteration, **metrics)
+        progress.set_postfix({k: f"{metrics[k]:.3f}" for k in ("return", "kl_approx", "real_success") if k in metrics})
+        if iteration in (0, settings.iterations - 1):
+            with RolloutWriter(
+                folder.rollouts(f"{target}_{iteration:03d}"),
+                metadata={"stage": target, "seed": config.seed},
+                overwrite=True,
+            ) as writer:
+                writer.write(wave)
+    collector.shutdown()
+    policy.save_pretrained(folder.checkpoint(target))
+
+
+def _update(decisions, loss, optimizer, parameter_groups, settings) -> dict[str, float]:
+    """K epochs of clipped updates on one batch of decisions, stopped when the policy has moved too far."""
+    sums: dict[str, float] = {}
+    count, stopped = 0, False
+    for _ in range(settings.epochs):
+        for rows in torch.randperm(len(decisions)).split(settings.minibatch_size):
+            out = loss(decisions[rows])
+            if out["kl_approx"].item() > settings.max_kl:
+                stopped = True
+                break
+            optimizer.zero_grad()
+            out["loss_objective"].backward()
+            for parameters in parameter_groups:
+                torch.nn.utils.clip_grad_norm_(parameters, settings.max_grad_norm)
+            optimizer.step()
+            count += 1
+            for name, value in out.items():
+                if value.numel() == 1:
+                    sums[name] = sums.get(name, 0.0) + value.item()
+        if stopped:
+            break
+    return {name: value / max(count, 1) for name, value in sums.items()} | {"updates": count, "kl_stop": float(stopped)}
+
+
+def _wave_metrics(wave, returns) -> dict[str, float]:
+    mask = wave[keys.MASK]
+    ended = (wave["next", "terminated"].squeeze(-1) & mask).any(-1)
+    metrics = {
+        "return": returns.mean().item(),
+        "stopped": ended.float().mean().item(),
+        "steps": (wave["next", keys.STEP_MASK] & mask[..., None]).sum((-2, -1)).float().mean().item(),
+        "degenerate_groups": (returns.std(-1) < 1e-3).float().mean().item(),
+    }
+    tasks = wave[keys.TASK_ID][..., 0, 0][:, 0]
+    for task in tasks.unique().tolist():
+        metrics[f"stopped_task_{task}"] = ended[tasks == task].float().mean().item()
+    return metrics
+
+
+def _probe(config, actor, world_model, reflector, contexts) -> dict[str, float]:
+    """Greedy success on training contexts: in the physics (reflector not involved) and in imagination."""
+    real, imagined = greedy_outcomes(config, actor, world_model, reflector, contexts, config.post_train.probe_contexts)
+    report = honesty(imagined.bool(), real.bool())
+    return {
+        "real_success": real.float().mean().item(),
+        "imagined_success": imagined.float().mean().item(),
+        "imagined_precision": float(report["precision"]),
+        "imagined_recall": float(report["recall"]),
+    }
+
+
+if __name__ == "__main__":
+    from world_env import run_single
+
+    run_single("post_train")

@@ -1,0 +1,150 @@
+"""One folder per run: what every stage reads from and writes to.
+
+``checkpoints/`` learned parts, ``rollouts/*.mcap`` logged rollouts, ``metrics.jsonl`` one line a measurement,
+``plots/*.png``, ``config.yaml`` the exact settings, ``stages/`` one marker per finished stage.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+MIN_FREE_GB = 1.0
+
+
+class RunFolder:
+    """A resumable run on disk.
+
+    A stage is finished when its marker exists; its outputs are written under their final names only when complete, so
+    a crash loses at most the running stage and ``run_stage`` simply runs that stage again.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        if self.path.exists() and not self.path.is_dir():
+            raise NotADirectoryError(f"run_dir must be a folder, {self.path} is a file; choose another --run-dir")
+
+    @property
+    def metrics_path(self) -> Path:
+        return self.path / "metrics.jsonl"
+
+    def checkpoint(self, name: str) -> Path:
+        return self.path / "checkpoints" / name
+
+    def rollouts(self, name: str) -> Path:
+        return self.path / "rollouts" / f"{name}.mcap"
+
+    def plot(self, name: str) -> Path:
+        return self.path / "plots" / f"{name}.png"
+
+    def require_checkpoint(self, name: str, stage: str) -> Path:
+        """Path of a checkpoint that ``stage`` writes; raises ``FileNotFoundError`` naming the stage to run."""
+        path = self.checkpoint(name)
+        if not path.is_dir():
+            raise FileNotFoundError(f"{path} does not exist: run the stage {stage!r} on this folder first")
+        return path
+
+    def require_rollouts(self, name: str, stage: str) -> Path:
+        """Path of a rollout file that ``stage`` writes; raises ``FileNotFoundError`` naming the stage to run."""
+        path = self.rollouts(name)
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} does not exist: run the stage {stage!r} on this folder first")
+        return path
+
+    def open(self, config: Any) -> None:
+        """Creates the folder, or checks that the one found was made with the same settings.
+
+        Raises:
+            ValueError: if ``config.yaml`` exists and differs, naming the first settings that do.
+            OSError: if less than :data:`MIN_FREE_GB` is free on the disk.
+        """
+        new = _plain(dataclasses.asdict(config))
+        self.path.mkdir(parents=True, exist_ok=True)
+        free_gb = shutil.disk_usage(self.path).free / 1e9
+        if free_gb < MIN_FREE_GB:
+            raise OSError(
+                f"{self.path} has {free_gb:.2f} GB free, a run needs {MIN_FREE_GB} GB: free some or change --run-dir"
+            )
+        stored = self.path / "config.yaml"
+        if stored.exists():
+            old = yaml.safe_load(stored.read_text())
+            changed = [
+                key
+                for key in _flat(new)
+                if _flat(old).get(key) != _flat(new)[key] and key not in {"run_dir", "num_threads"}
+            ]
+            if changed:
+                key = changed[0]
+                raise ValueError(
+                    f"{self.path} was made with {key}={_flat(old).get(key)!r}, now {_flat(new)[key]!r}"
+                    f"{f' (and {len(changed) - 1} more)' if len(changed) > 1 else ''}: use another --run-dir, or the same settings to continue"
+                )
+        for name in ("checkpoints", "rollouts", "plots", "stages"):
+            (self.path / name).mkdir(exist_ok=True)
+        _write_atomically(stored, yaml.safe_dump(new, sort_keys=False))
+
+    def done(self, stage: str) -> bool:
+        return (self.path / "stages" / stage).exists()
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Runs a stage: forgets the metrics an earlier, unfinished attempt left, and marks it finished at the end."""
+        marker = self.path / "stages" / name
+        marker.unlink(missing_ok=True)
+        kept = [line for line in self.read_metrics() if line["stage"] != name]
+        _write_atomically(self.metrics_path, "".join(json.dumps(line) + "\n" for line in kept))
+        started = time.monotonic()
+        yield
+        seconds = time.monotonic() - started
+        self.log(name, seconds=seconds)
+        _write_atomically(marker, f"{seconds:.1f}\n")
+
+    def log(self, stage: str, step: int | None = None, **values: Any) -> None:
+        """Appends one line to ``metrics.jsonl``."""
+        line = {"stage": stage} | ({} if step is None else {"step": step}) | _plain(values)
+        with self.metrics_path.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def read_metrics(self, stage: str | None = None) -> list[dict[str, Any]]:
+        """The lines of ``metrics.jsonl``, of one stage if named. A last line cut short by a crash is left out."""
+        if not self.metrics_path.exists():
+            return []
+        lines = []
+        for text in self.metrics_path.read_text().splitlines():
+            try:
+                lines.append(json.loads(text))
+            except json.JSONDecodeError:
+                continue
+        return [line for line in lines if stage in (None, line["stage"])]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    return value.item() if hasattr(value, "item") else value
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
+
+
+def _write_atomically(path: Path, text: str) -> None:
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(text)
+    os.replace(temporary, path)

@@ -1,0 +1,85 @@
+"""Supervised fine-tuning: L1 on action chunks, then the Laplace scale head alone (World-Env Eq. 8).
+
+Alone: ``python recipes/sft.py improve --run-dir runs/improve``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from config import WorldEnvConfig
+from parts import seed_everything, task_instructions
+from run_folder import RunFolder
+from torchrl.objectives import BCLoss
+from tqdm import trange
+
+from worldenv_trl import keys
+from worldenv_trl.data import episodes_from_rollouts, policy_samples
+from worldenv_trl.policies import OFTConfig, OFTPolicy, laplace_actor, random_shift
+from worldenv_trl.record import read_rollouts
+
+
+def run(config: WorldEnvConfig, folder: RunFolder) -> None:
+    """Reads ``rollouts/demonstrations.mcap``, writes ``checkpoints/sft``."""
+    settings = config.sft
+    seed_everything(config, offset=10)
+    episodes = episodes_from_rollouts(read_rollouts(folder.require_rollouts("demonstrations", "demonstrate")))
+    samples = policy_samples(episodes, config.chunk_length)
+    policy = OFTPolicy(
+        OFTConfig(
+            image_size=config.image_size,
+            chunk_length=config.chunk_length,
+            dim=settings.dim,
+            depth=settings.depth,
+            instructions=task_instructions(config),
+        )
+    )
+    policy.fit_statistics(samples[keys.STATE], samples[keys.CHUNK])
+    actor = laplace_actor(policy, event_dims=1)
+
+    heads_and_backbone = [*policy.backbone_parameters(), *policy.loc_head_parameters()]
+    loss = _behaviour_cloning(actor, "l1")
+    _train(loss, samples, heads_and_backbone, settings.steps, settings.lr, settings, folder, "l1")
+
+    # Only the scale head moves from here on (World-Env section 4.1).
+    policy.requires_grad_(False)
+    scale_head = list(policy.scale_head_parameters())
+    for parameter in scale_head:
+        parameter.requires_grad_(True)
+    loss = _behaviour_cloning(actor, None)
+    _train(loss, samples, scale_head, settings.scale_steps, settings.scale_lr, settings, folder, "nll")
+    policy.requires_grad_(True)
+    policy.save_pretrained(folder.checkpoint("sft"))
+
+
+def _behaviour_cloning(actor, loss_function: str | None) -> BCLoss:
+    loss = BCLoss(actor) if loss_function is None else BCLoss(actor, loss_function=loss_function)
+    loss.set_keys(action=keys.CHUNK, pad_mask=keys.ACTION_IS_PAD)
+    return loss
+
+
+def _train(loss, samples, parameters, steps, lr, settings, folder: RunFolder, name: str) -> None:
+    optimizer = torch.optim.AdamW(parameters, lr=lr, weight_decay=settings.weight_decay)
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimizer, lambda step: min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
+    )
+    progress = trange(steps, desc=f"sft {name}", unit="step")
+    for step in progress:
+        batch = samples[torch.randint(len(samples), (settings.batch_size,))]
+        batch[keys.IMAGE] = random_shift(batch[keys.IMAGE], settings.shift_px)
+        value = loss(batch)["loss_bc"]
+        optimizer.zero_grad()
+        value.backward()
+        torch.nn.utils.clip_grad_norm_(parameters, 1.0)
+        optimizer.step()
+        schedule.step()
+        if step % 50 == 0 or step == steps - 1:
+            folder.log("sft", step=step, **{name: value.item()})
+            progress.set_postfix(loss=f"{value.item():.4f}")
+
+
+if __name__ == "__main__":
+    from world_env import run_single
+
+    run_single("sft")

@@ -1,0 +1,361 @@
+"""Batched tabletop tasks in MuJoCo as a TorchRL environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from tensordict import NonTensorData, NonTensorStack, TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, NonTensor, Unbounded
+from torchrl.envs import EnvBase
+
+from worldenv_trl.envs.init_states import UNKNOWN_CONTEXT, InitStates
+from worldenv_trl.keys import (
+    ACTION,
+    ACTION_DIM,
+    CONTEXT_ID,
+    INSTRUCTION,
+    KINEMATIC_DIM,
+    KINEMATIC_STATE,
+    NUM_STEPS,
+    SIM_STATE,
+    STATE_DIM,
+    SUCCESS,
+    TASK_ID,
+)
+from worldenv_trl.scenes import SceneBatch, Task, load_task
+
+__all__ = ["TabletopEnv"]
+
+_IMAGE_NAMES = {"agentview": "image", "wrist": "wrist_image"}  # below "observation"
+
+
+@dataclass
+class _Block:
+    """The rows of one task."""
+
+    scene: SceneBatch
+    starts: InitStates
+    rows: np.ndarray  # [m] rows of the env
+    groups: np.ndarray  # [m] which of the task's groups a row belongs to
+    num_groups: int
+
+
+class TabletopEnv(EnvBase):
+    """``num_envs`` copies of one or several tasks, stepped and rendered together. Batch-locked; honours ``_step``.
+
+    A row's episode is a function of (seed, number of the episode, actions), bit for bit, whatever the batch and the
+    threads: the states that a batch of 16 draws in one reset are those that one row draws in 16 resets.
+
+    Args:
+        task: a task, its name, or several: groups of rows are dealt to the tasks in turn (round robin).
+        num_envs: rows.
+
+    Keyword Args:
+        image_size: height and width (px), at least 16.
+        cameras: ``agentview`` writes ``("observation", "image")``, ``wrist`` writes ``("observation", "wrist_image")``;
+            an empty tuple renders nothing.
+        init_split: ``train`` or ``test``.
+        init_state_mode: ``random`` (shuffled passes), ``cycle`` (in order, reset after reset, so that every state gets
+            its turn) or ``fixed``.
+        init_state_id: the fixed state, or where the cycle starts.
+        init_state_count: how many states of the split take part; 50 is the standard protocol.
+        init_states: float64 [K, S] to use instead of the split's (one task only), with their ``context_ids`` [K].
+        group_repeats: that many consecutive rows share one initial state (the rollouts of an RLOO group).
+        terminate_on_success: end a row when its goal holds; reward is 1 on that step, else 0. When False, a row runs to
+            ``max_steps`` and reward is the success of each step.
+        max_steps: env steps after which a row is truncated; the task's own when None.
+        proprio: ``measured`` writes the hand's pose and opening as they are, ``commanded`` the controller's targets.
+        with_sim_state: write MuJoCo's integration state, padded with zeros to the longest of the tasks.
+        seed: of the order of initial states; drawn from torch's generator when None.
+        num_threads: of physics and rendering; two at most by default.
+
+    Keys written: the images, ``("observation", "state")``, ``kinematic_state``, ``language_instruction``, ``task_id``,
+    ``context_id`` (:func:`~worldenv_trl.envs.init_states.context_id`), ``num_steps``, ``success``, optionally
+    ``sim_state``; then ``reward``, ``done``, ``terminated``, ``truncated``.
+
+    ``reset(td, set_state=True)`` starts every row from ``td``: from its ``sim_state`` (continuing at its ``num_steps``, if
+    given) or else from the initial state its ``context_id`` names. Of ``sim_state``, only an env built with
+    ``with_sim_state`` tells the transforms around it.
+
+    Raises:
+        ValueError: naming the unknown task, camera, split or mode, or the size out of bounds.
+        RuntimeError: if images are asked for and no GL backend works.
+
+    Examples:
+        >>> env = TabletopEnv("goal/open_the_top_drawer", 4, seed=0)
+        >>> rollout = env.rollout(3)
+        >>> rollout["observation", "image"].shape
+        torch.Size([4, 3, 3, 64, 64])
+    """
+
+    _supports_set_state = True
+
+    def __init__(
+        self,
+        task: str | Task | Sequence[str | Task],
+        num_envs: int = 1,
+        *,
+        image_size: int = 64,
+        cameras: Sequence[str] = ("agentview",),
+        init_split: str = "train",
+        init_state_mode: str = "random",
+        init_state_id: int = 0,
+        init_state_count: int = 50,
+        init_states: np.ndarray | torch.Tensor | None = None,
+        context_ids: Sequence[int] | None = None,
+        group_repeats: int = 1,
+        terminate_on_success: bool = True,
+        max_steps: int | None = None,
+        proprio: str = "measured",
+        with_sim_state: bool = False,
+        seed: int | None = None,
+        num_threads: int | None = None,
+    ) -> None:
+        tasks = [task] if isinstance(task, str | Task) else list(task)
+        tasks = [load_task(item) if isinstance(item, str) else item for item in tasks]
+        _check_counts(tasks, num_envs, group_repeats)
+        if proprio not in ("commanded", "measured"):
+            raise ValueError(f"proprio must be 'commanded' or 'measured', got {proprio!r}")
+        if max_steps is not None and max_steps < 1:
+            raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+        if init_states is not None and len(tasks) > 1:
+            raise ValueError("init_states are of one task: build one env for each task")
+        for name in cameras:
+            if name not in _IMAGE_NAMES:
+                raise ValueError(f"unknown camera {name!r}: it must be one of {', '.join(_IMAGE_NAMES)}")
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_envs]))
+        self.tasks, self.cameras, self.image_size = tuple(tasks), tuple(cameras), image_size
+        self.terminate_on_success, self.proprio, self.with_sim_state = terminate_on_success, proprio, with_sim_state
+        starts = [
+            InitStates(
+                item,
+                split=init_split,
+                mode=init_state_mode,
+                count=init_state_count,
+                init_state_id=init_state_id,
+                states=init_states,
+                context_ids=context_ids,
+            )
+            for item in tasks
+        ]
+        group = np.arange(num_envs) // group_repeats
+        self._blocks: list[_Block] = []
+        for slot, (item, choice) in enumerate(zip(tasks, starts, strict=True)):
+            rows = np.flatnonzero(group % len(tasks) == slot)
+            scene = SceneBatch(item, len(rows), image_size=image_size, cameras=cameras, num_threads=num_threads)
+            groups = group[rows] // len(tasks)
+            self._blocks.append(_Block(scene, choice, rows, groups, int(groups.max()) + 1))
+        self._make_buffers(max_steps)
+        self._make_specs()
+        self._set_seed(seed)
+
+    # ------------------------------------------------------------------------------------------------- set-up
+
+    def _make_buffers(self, max_steps: int | None) -> None:
+        n, size = self.num_envs, self.image_size
+        self._images = {name: np.zeros((n, 3, size, size), np.uint8) for name in self.cameras}
+        self._state = np.zeros((n, STATE_DIM), np.float32)
+        self._kinematic = np.zeros((n, KINEMATIC_DIM), np.float32)
+        self._sim_size = max(block.scene.batch.nstate for block in self._blocks)
+        self._context = np.full((n, 1), UNKNOWN_CONTEXT, np.int64)
+        self._steps = np.zeros((n, 1), np.int64)
+        self._success = np.zeros((n, 1), bool)
+        self._reward = np.zeros((n, 1), np.float32)
+        self._task, self._limit = np.zeros((n, 1), np.int64), np.zeros((n, 1), np.int64)
+        words = [""] * n
+        for block in self._blocks:
+            task = block.scene.task
+            self._task[block.rows] = task.task_id
+            self._limit[block.rows] = task.max_steps if max_steps is None else max_steps
+            for row in block.rows:
+                words[row] = task.language
+        self._text = NonTensorStack(*(NonTensorData(text) for text in words))
+
+    def _make_specs(self) -> None:
+        batch = self.batch_size
+
+        def real(width: int) -> Unbounded:
+            return Unbounded(shape=(*batch, width), device=self.device)
+
+        def integer() -> Unbounded:
+            return Unbounded(shape=(*batch, 1), dtype=torch.int64, device=self.device)
+
+        def flag() -> Binary:
+            return Binary(shape=(*batch, 1), dtype=torch.bool, device=self.device)
+
+        def nested(entries: dict) -> Composite:
+            return Composite(entries, shape=batch, device=self.device)
+
+        pixels = {
+            _IMAGE_NAMES[name]: Bounded(0, 255, shape=(*batch, *image.shape[1:]), dtype=torch.uint8, device=self.device)
+            for name, image in self._images.items()
+        }
+        observation = {
+            "observation": nested({**pixels, "state": real(STATE_DIM)}),
+            KINEMATIC_STATE: real(KINEMATIC_DIM),
+            INSTRUCTION: NonTensor(shape=batch, example_data=self.tasks[0].language, device=self.device),
+            TASK_ID: integer(),
+            CONTEXT_ID: integer(),
+            NUM_STEPS: integer(),
+            SUCCESS: flag(),
+        }
+        state = {CONTEXT_ID: integer(), NUM_STEPS: integer()}
+        if self.with_sim_state:
+            observation[SIM_STATE] = Unbounded(shape=(*batch, self._sim_size), dtype=torch.float64, device=self.device)
+            state[SIM_STATE] = observation[SIM_STATE].clone()
+        self.observation_spec = nested(observation)
+        self.state_spec = nested(state)
+        self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, ACTION_DIM), device=self.device)
+        self.reward_spec = real(1)
+        self.done_spec = nested({"done": flag(), "terminated": flag(), "truncated": flag()})
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = int(torch.randint(2**31, ()).item()) if seed is None else int(seed)
+        self._episode = np.full(self.num_envs, -1)
+        for block in self._blocks:
+            block.starts.seed(self._seed)
+
+    @property
+    def num_envs(self) -> int:
+        return self.batch_size[0]
+
+    # ------------------------------------------------------------------------------------------------- reset
+
+    def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
+        return False  # a state is honoured when set_state=True asks for it, never because it happens to be there
+
+    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        mask = np.ones(self.num_envs, bool) if mask is None else mask.reshape(-1).numpy()
+        # Rows reset together stay in step, so that the rows of a group share their initial states.
+        self._episode[mask] = self._episode[mask].max(initial=-1) + 1 if mask.all() else self._episode[mask] + 1
+        self._steps[mask] = 0
+        for block in self._blocks:
+            local = np.flatnonzero(mask[block.rows])
+            if not len(local):
+                continue
+            rows = block.rows[local]
+            numbers, states = self._given(tensordict, block, rows) if set_state else self._drawn(block, local)
+            block.scene.reset(local, states)
+            self._context[rows, 0] = numbers
+        self._read(mask)
+        self._reward[mask] = 0
+        out = self._observe()
+        out.update(self.full_done_spec.zero())
+        return out
+
+    def _drawn(self, block: _Block, local: np.ndarray) -> tuple[list[int], np.ndarray]:
+        """The next initial states of a task's rows."""
+        order = self._episode[block.rows[local]] * block.num_groups + block.groups[local]
+        numbers, states = zip(*(block.starts.draw(int(number)) for number in order), strict=True)
+        return list(numbers), np.stack(states)
+
+    def _given(self, tensordict: TensorDictBase | None, block: _Block, rows: np.ndarray) -> tuple[list[int], np.ndarray]:
+        """The states of a task's ``rows`` that the caller put into the reset's tensordict."""
+        given = TensorDict() if tensordict is None else tensordict
+        sim_state, numbers, task = (given.get(key, None) for key in (SIM_STATE, CONTEXT_ID, TASK_ID))
+        if sim_state is None and numbers is None:
+            raise ValueError(f"reset(set_state=True) needs {SIM_STATE!r} or {CONTEXT_ID!r} in its tensordict")
+        if task is not None and (task.reshape(-1).numpy()[rows] != block.scene.task.task_id).any():
+            raise ValueError(f"reset(set_state=True): rows {rows.tolist()} run {block.scene.task.name}, {TASK_ID} says otherwise")
+        numbers = [UNKNOWN_CONTEXT] * len(rows) if numbers is None else numbers.reshape(-1).numpy()[rows].tolist()
+        if sim_state is None:
+            return numbers, np.stack([block.starts.find(number) for number in numbers])
+        length = block.scene.batch.nstate
+        if sim_state.shape[:-1] != self.batch_size or sim_state.shape[-1] < length:
+            raise ValueError(
+                f"{SIM_STATE} must be [{self.num_envs}, {self._sim_size}] for {block.scene.task.name}, got {list(sim_state.shape)}"
+            )
+        steps = given.get(NUM_STEPS, None)
+        if steps is not None:
+            steps = steps.reshape(-1, 1).numpy()[rows]
+            if (steps >= self._limit[rows]).any():
+                raise ValueError(f"a state at {NUM_STEPS}={int(steps.max())} is past max_steps={int(self._limit[rows].min())}")
+            self._steps[rows] = steps
+        return numbers, sim_state.numpy().astype(np.float64, copy=False)[rows, :length]
+
+    # ------------------------------------------------------------------------------------------------- step
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        active = tensordict.get("_step", None)
+        active = np.ones(self.num_envs, bool) if active is None else active.reshape(-1).numpy()
+        action = self._checked_action(tensordict, active)
+        for block in self._blocks:
+            block.scene.step(action[block.rows], active[block.rows])
+        self._steps[active] += 1
+        self._read(active)
+        self._reward[active] = self._success[active]
+        out = self._observe()
+        terminated = self._success & self.terminate_on_success
+        truncated = ~terminated & (self._steps >= self._limit)
+        out.set("reward", torch.from_numpy(self._reward.copy()))
+        for name, value in (("terminated", terminated), ("truncated", truncated), ("done", terminated | truncated)):
+            out.set(name, torch.from_numpy(value))
+        return out
+
+    def _checked_action(self, tensordict: TensorDictBase, active: np.ndarray) -> np.ndarray:
+        action = tensordict.get(ACTION, None)
+        expected = (self.num_envs, ACTION_DIM)
+        if action is None:
+            raise ValueError(f"the tensordict holds no {ACTION!r} {list(expected)}: call the policy first")
+        if tuple(action.shape) != expected or not action.is_floating_point():
+            raise ValueError(f"{ACTION!r} must be floats {list(expected)}, got {action.dtype} {list(action.shape)}")
+        action = action.detach().cpu().to(torch.float64).numpy()
+        broken = ~np.isfinite(action).all(-1) & active
+        if broken.any():
+            raise ValueError(f"{ACTION!r} holds NaN or infinity in rows {np.flatnonzero(broken).tolist()}")
+        return action
+
+    def _read(self, active: np.ndarray) -> None:
+        """Brings what ``active`` rows show up to date."""
+        for block in self._blocks:
+            local = np.flatnonzero(active[block.rows])
+            if not len(local):
+                continue
+            scene, rows = block.scene, block.rows[local]
+            for name, images in scene.render(local).items():
+                self._images[name][rows] = images
+            state = scene.measured_state() if self.proprio == "measured" else scene.commanded_state()
+            self._state[rows], self._kinematic[rows] = state[local], scene.kinematic_state()[local]
+            self._success[rows, 0] = scene.success()[local]
+
+    def _observe(self) -> TensorDictBase:
+        """A copy of what all rows show."""
+        copies = {_IMAGE_NAMES[name]: image.copy() for name, image in self._images.items()}
+        copies["state"] = self._state.copy()
+        out = {
+            "observation": {name: torch.from_numpy(value) for name, value in copies.items()},
+            KINEMATIC_STATE: torch.from_numpy(self._kinematic.copy()),
+            TASK_ID: torch.from_numpy(self._task.copy()),
+            CONTEXT_ID: torch.from_numpy(self._context.copy()),
+            NUM_STEPS: torch.from_numpy(self._steps.copy()),
+            SUCCESS: torch.from_numpy(self._success.copy()),
+        }
+        if self.with_sim_state:
+            padded = np.zeros((self.num_envs, self._sim_size))
+            for block in self._blocks:
+                padded[block.rows, : block.scene.batch.nstate] = block.scene.sim_state()
+            out[SIM_STATE] = torch.from_numpy(padded)
+        out = TensorDict(out, batch_size=self.batch_size, device=self.device)
+        out.set(INSTRUCTION, self._text)
+        return out
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        if not self.is_closed:
+            for block in self._blocks:
+                block.scene.close()
+        super().close(raise_if_closed=raise_if_closed)
+
+
+def _check_counts(tasks: list[Task], num_envs: int, group_repeats: int) -> None:
+    if not tasks:
+        raise ValueError("task is empty: name at least one, for instance 'goal/open_the_top_drawer'")
+    if len({task.name for task in tasks}) < len(tasks):
+        raise ValueError(f"a task is named twice: {', '.join(task.name for task in tasks)}")
+    if num_envs < 1 or group_repeats < 1 or num_envs % group_repeats:
+        raise ValueError(f"num_envs must be a positive multiple of group_repeats, got {num_envs} and {group_repeats}")
+    if num_envs // group_repeats < len(tasks):
+        raise ValueError(f"{len(tasks)} tasks need at least {len(tasks) * group_repeats} rows, got num_envs={num_envs}")
