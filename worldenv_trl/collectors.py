@@ -1,0 +1,167 @@
+"""Complete groups of rollouts behind TorchRL's collector interface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from worldenv_trl import keys
+
+__all__ = ["GroupCollector"]
+
+
+class GroupCollector:
+    """Waves of rollouts in which every row runs to its own end: groups are complete, none is cut or started twice.
+
+    Stock collectors reset rows as they finish, which leaves the groups of a leave-one-out baseline unfinished and biased.
+    Here a wave resets all rows, rolls until every row is done, and marks what each rollout executed.
+
+    Args:
+        env: batch ``[G, N]``, or a flat ``[G * N]`` with ``group_size=N`` (consecutive rows are a group).
+        policy: the behaviour policy; it must not change while a batch is collected.
+
+    Keyword Args:
+        groups_per_batch: groups in each yielded batch, a multiple of ``G``.
+        total_groups: stop after so many; -1 never stops.
+        group_size: see ``env``.
+        max_decisions: longest rollout in env steps (decisions, for a chunked env); default 10,000.
+        exploration_type: of the policy; ``DETERMINISTIC`` is greedy.
+
+    Yields:
+        TensorDict ``[groups, N, T]`` as ``env.rollout`` writes it, with ``("collector", "mask")`` bool [groups, N, T]:
+        False after a rollout's end, and ``returns`` float32 [groups, N, T]: the sum of the rollout's rewards, the same at
+        each of its entries.
+
+    Raises:
+        ValueError: if sizes do not divide.
+
+    Examples:
+        >>> for batch in GroupCollector(env, actor, groups_per_batch=24, total_groups=240):
+        ...     advantage = rloo_advantage(batch["returns"][..., 0])
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        policy: TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase] | None = None,
+        *,
+        groups_per_batch: int,
+        total_groups: int = -1,
+        group_size: int | None = None,
+        max_decisions: int | None = None,
+        exploration_type: ExplorationType = ExplorationType.RANDOM,
+    ) -> None:
+        shape = tuple(env.batch_size)
+        if len(shape) == 1:
+            size = 1 if group_size is None else group_size
+            if size < 1 or shape[0] % size:
+                raise ValueError(f"group_size must divide the env's {shape[0]} rows, got {size}")
+            shape = (shape[0] // size, size)
+        elif len(shape) != 2 or group_size not in (None, shape[1]):
+            raise ValueError(f"env.batch_size must be [G, N] or [G * N] with group_size=N, got {list(env.batch_size)}")
+        if groups_per_batch < 1 or groups_per_batch % shape[0]:
+            raise ValueError(
+                f"groups_per_batch must be a multiple of the env's {shape[0]} groups, got {groups_per_batch}"
+            )
+        if total_groups != -1 and (total_groups < 1 or total_groups % groups_per_batch):
+            raise ValueError(f"total_groups must be -1 or a multiple of {groups_per_batch}, got {total_groups}")
+        self.env, self.policy = env, policy
+        self.group_shape = shape
+        self.groups_per_batch, self.total_groups = groups_per_batch, total_groups
+        self.max_decisions = 10_000 if max_decisions is None else max_decisions
+        self.exploration_type = exploration_type
+        self._groups = 0
+        self.closed = False
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        while self.total_groups == -1 or self._groups < self.total_groups:
+            yield self.next()
+
+    def __len__(self) -> int:
+        """Batches in all; raises ``RuntimeError`` for an endless collector."""
+        if self.total_groups == -1:
+            raise RuntimeError("this collector is endless (total_groups=-1): it has no length")
+        return self.total_groups // self.groups_per_batch
+
+    def next(self) -> TensorDictBase:
+        """The next batch of complete groups."""
+        if self.closed:
+            raise RuntimeError("this collector was shut down: make a new one")
+        waves = [self._wave() for _ in range(self.groups_per_batch // self.group_shape[0])]
+        length = max(wave.shape[-1] for wave in waves)
+        batch = waves[0] if len(waves) == 1 else torch.cat([_padded(wave, length) for wave in waves], 0)
+        self._groups += self.groups_per_batch
+        return batch
+
+    @torch.no_grad()
+    def _wave(self) -> TensorDictBase:
+        training = isinstance(self.policy, nn.Module) and self.policy.training
+        if training:
+            self.policy.eval()
+        with set_exploration_type(self.exploration_type):
+            rollout = self.env.rollout(
+                self.max_decisions, self.policy, break_when_any_done=False, break_when_all_done=True
+            )
+        if training:
+            self.policy.train()
+        rollout = rollout.reshape(*self.group_shape, rollout.shape[-1])
+        done = rollout["next", "done"].squeeze(-1)  # [G, N, T]
+        # A finished row repeats its last entry, reward included: only what comes up to the first done belongs to it.
+        mask = (done.cumsum(-1) - done.long()) == 0
+        rollout[keys.MASK] = mask
+        rewards = rollout["next", "reward"].squeeze(-1)
+        rollout["returns"] = torch.where(mask, rewards, 0.0).sum(-1, keepdim=True).expand_as(rewards).contiguous()
+        return rollout
+
+    def update_policy_weights_(self, policy_or_weights: Any = None, **_: Any) -> None:
+        """Loads weights into the behaviour policy (a module, a state dict or a TensorDict of parameters).
+
+        Without an argument it does nothing: the collector calls the very policy it was given.
+        """
+        if policy_or_weights is None or policy_or_weights is self.policy:
+            return
+        if isinstance(policy_or_weights, nn.Module):
+            self.policy.load_state_dict(policy_or_weights.state_dict())
+        elif isinstance(policy_or_weights, TensorDictBase):
+            policy_or_weights.data.to_module(self.policy, inplace=True)
+        else:
+            self.policy.load_state_dict(policy_or_weights)
+
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        """Seeds the env and torch (the policy's samples); returns the env's next seed."""
+        torch.manual_seed(seed)
+        return self.env.set_seed(seed, static_seed=static_seed)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Progress and the policy's weights."""
+        policy = self.policy.state_dict() if isinstance(self.policy, nn.Module) else {}
+        return {"groups": self._groups, "policy_state_dict": policy}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self._groups = int(state_dict["groups"])
+        if isinstance(self.policy, nn.Module):
+            self.policy.load_state_dict(state_dict["policy_state_dict"])
+
+    def shutdown(self, **_: Any) -> None:
+        """Closes the env."""
+        if not self.closed:
+            self.closed = True
+            if not self.env.is_closed:
+                self.env.close()
+
+
+def _padded(wave: TensorDictBase, length: int) -> TensorDictBase:
+    """``wave [G, N, T]`` extended to ``length`` by repeating its last entry, outside the mask."""
+    missing = length - wave.shape[-1]
+    if not missing:
+        return wave
+    tail = wave[..., -1:].expand(*wave.shape[:-1], missing).clone()
+    tail[keys.MASK] = torch.zeros_like(tail[keys.MASK])
+    return torch.cat([wave, tail], -1)
