@@ -105,6 +105,26 @@ def test_the_second_chunk_remembers_real_frames_or_what_the_model_painted(unroll
     assert loss.item() == pytest.approx(expected, rel=1e-4)
 
 
+def test_painting_some_frames_scores_exactly_those(monkeypatch):
+    model, td = make_model(), make_windows()
+    chosen = iter([torch.tensor([0, 3, 7]), torch.tensor([1, 2, 6])])
+    loss = DiffusionLoss(model, unroll_prob=1.0, frames_per_chunk=3)
+    monkeypatch.setattr(loss, "_draw_frames", lambda *_: next(chosen))
+    value = loss(td)["loss_diffusion"]
+    masked = td.clone()
+    masked["target_mask"][:] = False
+    masked["target_mask"][:, [0, 3, 7, 9, 10, 14]] = True
+    expected = DiffusionLoss(model, unroll_prob=1.0)(masked)["loss_diffusion"]
+    assert value.item() == pytest.approx(expected.item(), rel=1e-4)
+
+
+def test_the_frames_that_the_next_chunk_remembers_are_always_painted():
+    loss = DiffusionLoss(make_model(), frames_per_chunk=3)
+    drawn = [loss._draw_frames(False, torch.device("cpu")) for _ in range(30)]
+    assert all({3, 7} <= set(frames.tolist()) and len(frames) == 3 for frames in drawn)
+    assert set(torch.cat(drawn).tolist()) == set(range(8))
+
+
 def test_frames_past_the_end_of_the_episode_do_not_count():
     loss, td = DiffusionLoss(make_model(), unroll_prob=0.0), make_windows()
     td["target_mask"][:, 11:] = False

@@ -60,6 +60,9 @@ class DiffusionLoss(LossModule):
         noise_prob: share of rows trained at random noise levels; default: 0 for a deterministic model, else 0.5.
         l1_weight: weight of the absolute error.
         moving_weight: additional weight of moving pixels.
+        frames_per_chunk: frames of each chunk that are painted and scored, drawn anew for every call (those that the
+            next chunk remembers are always among them); None is all. Neighbouring frames teach much the same, and the
+            decoder is a large part of the cost.
         moving_threshold: difference, as a fraction of the intensity range, from which a pixel counts as moving.
 
     Raises:
@@ -83,6 +86,7 @@ class DiffusionLoss(LossModule):
         noise_prob: float | None = None,
         l1_weight: float = 0.15,
         moving_weight: float = 4.0,
+        frames_per_chunk: int | None = None,
         moving_threshold: float = 0.05,
     ) -> None:
         super().__init__()
@@ -93,6 +97,10 @@ class DiffusionLoss(LossModule):
                 raise ValueError(f"{name} must lie between 0 and 1, got {value}")
         if min(l1_weight, moving_weight) < 0:
             raise ValueError(f"l1_weight and moving_weight must not be negative, got {l1_weight} and {moving_weight}")
+        if frames_per_chunk is not None and not 2 <= frames_per_chunk <= world_model.chunk_length:
+            length = world_model.chunk_length
+            raise ValueError(f"frames_per_chunk must lie between 2 and {length}, got {frames_per_chunk}")
+        self.frames_per_chunk = frames_per_chunk
         # The module is trained in place: no functional copy of its parameters is made.
         self.world_model = world_model
         self.unroll_prob, self.noise_prob = float(unroll_prob), float(noise_prob)
@@ -133,13 +141,18 @@ class DiffusionLoss(LossModule):
                 },
                 batch_size=targets.shape[:1],
             )
+            last_chunk = start + length == targets.shape[1]
+            frames = self._draw_frames(last_chunk, targets.device)
             cells = to_cells(chunk, patch)  # [B, C, 3, P, h, w], the model's layout
-            clean = to_float(cells)
+            clean = to_float(cells if self.noise_prob or frames is None else cells[:, frames])
             level = torch.rand(targets.shape[0], device=targets.device) * noised
             noisy = None
             if self.noise_prob:
                 noisy = add_noise(clean, torch.randn_like(clean), level) * noised.view(-1, 1, 1, 1, 1, 1)
-            predicted = model.predict(noisy, level, model.conditions(inputs))
+            predicted = model.predict(noisy, level, model.conditions(inputs), frames)
+            if frames is not None:
+                cells, valid = cells[:, frames], valid[:, frames]
+                clean = clean[:, frames] if self.noise_prob else clean
 
             moving = self._moving(cells, reference, to_cells(real_memory[:, -1], patch))  # [B, C, 1, P, h, w]
             pixel_weight = (1 + self.moving_weight * moving) * valid.view(*valid.shape, 1, 1, 1, 1)
@@ -150,9 +163,12 @@ class DiffusionLoss(LossModule):
             with torch.no_grad():
                 sums += self._squares(error, moving, valid & ~noised.unsqueeze(-1))
 
-            if start + length < targets.shape[1]:
+            if not last_chunk:
+                painted = _painted(predicted, patch)
+                if frames is not None:  # only frames that were painted are remembered
+                    painted = torch.zeros_like(chunk).index_copy_(1, frames, painted)
                 real_memory = model.next_memory(real_memory, chunk)
-                own_memory = model.next_memory(memory, _painted(predicted, patch))
+                own_memory = model.next_memory(memory, painted)
                 own = torch.rand(targets.shape[0], device=targets.device) < self.unroll_prob
                 # A prediction from an almost clean chunk is not what the model would imagine.
                 own = own & (level < 0.5)
@@ -165,6 +181,15 @@ class DiffusionLoss(LossModule):
                 "moving_mse": sums[2] / sums[3].clamp(min=1.0),
             }
         )
+
+    def _draw_frames(self, last_chunk: bool, device: torch.device) -> Tensor | None:
+        length = self.world_model.chunk_length
+        if self.frames_per_chunk in (None, length):
+            return None
+        order = torch.rand(length)
+        if not last_chunk:  # the next chunk's memory: see VideoWorldModel.next_memory
+            order[[length - 1, max(length - 1 - self.world_model.config.memory_stride, 0)]] = -1.0
+        return order.argsort()[: self.frames_per_chunk].sort().values.to(device)
 
     def _moving(self, chunk: Tensor, reference: Tensor, last: Tensor) -> Tensor:
         """1 where a pixel of the chunk differs from the reference or the last frame before it: [B, C, 1, P, h, w]."""

@@ -118,6 +118,7 @@ class Denoiser(nn.Module):
         motion: Tensor,
         condition: Tensor,
         reference: Tensor,
+        frames: Tensor | None = None,
     ) -> Tensor:
         """Images are float in [-1, 1].
 
@@ -130,9 +131,11 @@ class Denoiser(nn.Module):
             motion: [B, C, 2], the tool's motion on the image since the last frame, in pixels.
             condition: [B, D], poses and actions.
             reference: [B, 3, H, W].
+            frames: int64 [F], which frames of the chunk to paint, or None for all. The trunk always sees the whole
+                chunk; leaving frames out saves the decoder's share.
 
         Returns:
-            x_0 float32 [B, C, 3, P, h, w].
+            x_0 float32 [B, C or F, 3, P, h, w].
         """
         batch, chunk = motion.shape[:2]
         embedding = self.condition(condition) + self.reference(reference) + self.noise_level(noise_level.unsqueeze(-1))
@@ -165,10 +168,12 @@ class Denoiser(nn.Module):
                 trunk = block(trunk, embedding)
 
         decoded = _channels_to_frames(F.silu(self.split(trunk)), chunk)
+        if frames is not None:
+            every = (torch.arange(batch, device=frames.device).unsqueeze(-1) * chunk + frames).flatten()
+            decoded, per_frame, motion = decoded[every], per_frame[every], motion[:, frames]
         decoded = F.silu(self.frame_out(torch.cat([decoded, per_frame], 1)))
-        painted = (
-            self.paint(decoded).float().contiguous().unflatten(1, (-1, self.patch**2)).unflatten(0, (batch, chunk))
-        )
+        painted = self.paint(decoded).float().contiguous().unflatten(1, (-1, self.patch**2))
+        painted = painted.unflatten(0, (batch, motion.shape[1]))
         weight = painted[:, :, :_CANDIDATES].softmax(2).unsqueeze(3)  # [B, C, 4, 1, P, h, w]
         colour, flow = painted[:, :, _CANDIDATES : _CANDIDATES + 3], painted[:, :, _CANDIDATES + 3 :]
         moved = self._move(memory[:, -1], motion + flow.movedim(2, -1))

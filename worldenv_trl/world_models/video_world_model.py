@@ -203,13 +203,16 @@ class VideoWorldModel(TensorDictModuleBase, Pretrained):
             "reference": to_float(tensordict[REFERENCE]),
         }
 
-    def predict(self, noisy: Tensor | None, level: Tensor, conditions: dict[str, Tensor]) -> Tensor:
+    def predict(
+        self, noisy: Tensor | None, level: Tensor, conditions: dict[str, Tensor], frames: Tensor | None = None
+    ) -> Tensor:
         """x_0 from the noisy chunk (None: zeros) at noise level [B] (0: pure noise or zeros).
 
-        Both are float cells [B, C, 3, patch^2, h, w] of images in [-1, 1], see :func:`to_cells`.
+        Both are float cells [B, C, 3, patch^2, h, w] of images in [-1, 1], see :func:`to_cells`. ``frames`` int64 [F]
+        asks for some frames of the chunk only.
         """
         with torch.autocast(level.device.type, torch.bfloat16, enabled=self._bfloat16(level.device)):
-            return self.denoiser(noisy, level, **conditions)
+            return self.denoiser(noisy, level, **conditions, frames=frames)
 
     def _bfloat16(self, device: torch.device) -> bool:
         if self.config.precision == "auto":
