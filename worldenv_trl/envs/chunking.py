@@ -66,7 +66,9 @@ class ChunkedActions(MultiAction):
         parent = self.parent
         chunk = self._checked_chunk(tensordict)
         active = tensordict.get("_step", None)
-        active = torch.ones(parent.batch_size, dtype=torch.bool) if active is None else active.reshape(parent.batch_size)
+        active = (
+            torch.ones(parent.batch_size, dtype=torch.bool) if active is None else active.reshape(parent.batch_size)
+        )
         self._executed: list[torch.Tensor] = []
         self._shown: dict = {source: [] for _, source in _PER_STEP} if self.frames else {}
         self._reward: torch.Tensor | None = None
@@ -123,7 +125,9 @@ class ChunkedActions(MultiAction):
         if chunk is None:
             raise ValueError(f"the tensordict holds no action chunk {CHUNK} {list(expected)}: call the policy first")
         if tuple(chunk.shape) != expected or not chunk.is_floating_point():
-            raise ValueError(f"the action chunk {CHUNK} must be floats {list(expected)}, got {chunk.dtype} {list(chunk.shape)}")
+            raise ValueError(
+                f"the action chunk {CHUNK} must be floats {list(expected)}, got {chunk.dtype} {list(chunk.shape)}"
+            )
         return chunk
 
     # ------------------------------------------------------------------------------------------------- specs

@@ -24,8 +24,8 @@ class InitStates:
     Args:
         task: the task.
         split: ``train`` or ``test``.
-        mode: ``random`` (shuffled pass after shuffled pass over the states), ``cycle`` (in order, from ``init_state_id``
-            on) or ``fixed`` (``init_state_id`` always).
+        mode: ``random`` (shuffled pass after shuffled pass over the states), ``cycle`` (in order, from
+            ``init_state_id`` on) or ``fixed`` (``init_state_id`` always).
         count: how many states of the split take part.
         init_state_id: see ``mode``.
         states: ``[K, S]`` states to use instead of the split's.
@@ -56,7 +56,9 @@ class InitStates:
         states = np.atleast_2d(np.asarray(states, np.float64))
         context_ids = [UNKNOWN_CONTEXT] * len(states) if context_ids is None else [int(i) for i in context_ids]
         if len(states) == 0 or len(context_ids) != len(states):
-            raise ValueError(f"got {len(states)} init_states and {len(context_ids)} context_ids: both must be as long, at least 1")
+            raise ValueError(
+                f"got {len(states)} init_states and {len(context_ids)} context_ids: both must be as long, at least 1"
+            )
         if not 0 <= init_state_id < len(states):
             raise ValueError(f"init_state_id must be in [0, {len(states)}), got {init_state_id}")
         self.task, self.mode, self.states, self.context_ids = task, mode, states, context_ids
@@ -67,7 +69,7 @@ class InitStates:
         self._seed, self._orders = seed, {}
 
     def draw(self, number: int) -> tuple[int, np.ndarray]:
-        """Context id and state ``[S]`` of the task's ``number``-th episode: a function of the seed and the number only."""
+        """Context id and state ``[S]`` of the task's ``number``-th episode: a function of seed and number only."""
         count = len(self.states)
         if self.mode == "fixed":
             index = self.init_state_id

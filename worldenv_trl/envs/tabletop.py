@@ -76,9 +76,9 @@ class TabletopEnv(EnvBase):
     ``context_id`` (:func:`~worldenv_trl.envs.init_states.context_id`), ``num_steps``, ``success``, optionally
     ``sim_state``; then ``reward``, ``done``, ``terminated``, ``truncated``.
 
-    ``reset(td, set_state=True)`` starts every row from ``td``: from its ``sim_state`` (continuing at its ``num_steps``, if
-    given) or else from the initial state its ``context_id`` names. Of ``sim_state``, only an env built with
-    ``with_sim_state`` tells the transforms around it.
+    ``reset(td, set_state=True)`` starts every row from ``td``: from its ``sim_state`` (continuing at its ``num_steps``,
+    if given) or else from the initial state its ``context_id`` names. Transforms around the env hand ``sim_state`` on
+    only if it was built with ``with_sim_state``.
 
     Raises:
         ValueError: naming the unknown task, camera, split or mode, or the size out of bounds.
@@ -253,27 +253,34 @@ class TabletopEnv(EnvBase):
         numbers, states = zip(*(block.starts.draw(int(number)) for number in order), strict=True)
         return list(numbers), np.stack(states)
 
-    def _given(self, tensordict: TensorDictBase | None, block: _Block, rows: np.ndarray) -> tuple[list[int], np.ndarray]:
+    def _given(
+        self, tensordict: TensorDictBase | None, block: _Block, rows: np.ndarray
+    ) -> tuple[list[int], np.ndarray]:
         """The states of a task's ``rows`` that the caller put into the reset's tensordict."""
         given = TensorDict() if tensordict is None else tensordict
         sim_state, numbers, task = (given.get(key, None) for key in (SIM_STATE, CONTEXT_ID, TASK_ID))
         if sim_state is None and numbers is None:
             raise ValueError(f"reset(set_state=True) needs {SIM_STATE!r} or {CONTEXT_ID!r} in its tensordict")
         if task is not None and (task.reshape(-1).numpy()[rows] != block.scene.task.task_id).any():
-            raise ValueError(f"reset(set_state=True): rows {rows.tolist()} run {block.scene.task.name}, {TASK_ID} says otherwise")
+            raise ValueError(
+                f"reset(set_state=True): rows {rows.tolist()} run {block.scene.task.name}, {TASK_ID} says otherwise"
+            )
         numbers = [UNKNOWN_CONTEXT] * len(rows) if numbers is None else numbers.reshape(-1).numpy()[rows].tolist()
         if sim_state is None:
             return numbers, np.stack([block.starts.find(number) for number in numbers])
         length = block.scene.batch.nstate
         if sim_state.shape[:-1] != self.batch_size or sim_state.shape[-1] < length:
             raise ValueError(
-                f"{SIM_STATE} must be [{self.num_envs}, {self._sim_size}] for {block.scene.task.name}, got {list(sim_state.shape)}"
+                f"{SIM_STATE} must be [{self.num_envs}, {self._sim_size}] for {block.scene.task.name}, "
+                f"got {list(sim_state.shape)}"
             )
         steps = given.get(NUM_STEPS, None)
         if steps is not None:
             steps = steps.reshape(-1, 1).numpy()[rows]
             if (steps >= self._limit[rows]).any():
-                raise ValueError(f"a state at {NUM_STEPS}={int(steps.max())} is past max_steps={int(self._limit[rows].min())}")
+                raise ValueError(
+                    f"a state at {NUM_STEPS}={int(steps.max())} is past max_steps={int(self._limit[rows].min())}"
+                )
             self._steps[rows] = steps
         return numbers, sim_state.numpy().astype(np.float64, copy=False)[rows, :length]
 

@@ -1,8 +1,10 @@
 """What the world is made of: robot, objects, tasks, predicates, simulation, expert. NumPy and MuJoCo only."""
 
+from worldenv_trl.scenes.rendering import RendererPool  # first: where GL is missing, this says what to install
+
+# isort: split
 from worldenv_trl.scenes.camera import Camera
 from worldenv_trl.scenes.expert import ScriptedExpert
-from worldenv_trl.scenes.rendering import RendererPool
 from worldenv_trl.scenes.simulation import SceneBatch
 from worldenv_trl.scenes.tasks import Task, list_suites, list_tasks, load_task
 

@@ -1,7 +1,7 @@
 """Pose control of the arm: accumulated targets and one damped least-squares step per control step.
 
-Adding an action to the *current* pose drifts by centimetres in a second; the targets here are accumulated instead. NumPy,
-batched over rows; :class:`worldenv_trl.kinematics.ForwardKinematics` is the same rule in PyTorch.
+Adding an action to the *current* pose drifts by centimetres in a second; the targets here are accumulated instead.
+NumPy, batched over rows; :class:`worldenv_trl.kinematics.ForwardKinematics` is the same rule in PyTorch.
 """
 
 from __future__ import annotations
@@ -100,8 +100,8 @@ def vector_from_rotation(rotation: np.ndarray) -> np.ndarray:
 def hand_axis_angle(rotation: np.ndarray) -> np.ndarray:
     """Axis-angle ``[n, 3]`` (rad) of ``[n, 3, 3]``, continuous around a hand that points down.
 
-    The hand works near a half turn about x, where the usual choice (angle at most pi) flips its sign for nothing; here the
-    axis keeps a positive x component and the angle runs to 2 pi.
+    The hand works near a half turn about x, where the usual choice (angle at most pi) flips its sign for nothing; here
+    the axis keeps a positive x component and the angle runs to 2 pi.
     """
     vector = vector_from_rotation(rotation)
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)

@@ -111,15 +111,15 @@ class Panda(composer.Entity):
         body.add("geom", type="capsule", fromto=(0, 0, 0.02, 0, 0, 0.13), size=(0.07,))
         self._joints = []
         for joint, (start, end, radius), torque in zip(JOINTS, _LINKS, _TORQUE_LIMITS, strict=True):
-            # MuJoCo's lower-case xyz Euler sequence is intrinsic; only single-axis angles occur here, so either reads the same.
+            # Only single-axis angles occur here, so URDF's roll, pitch, yaw and MuJoCo's Euler angles read the same.
             body = body.add(
                 "body", name=joint.name.replace("joint", "link"), pos=joint.xyz, euler=joint.rpy, gravcomp=1
             )
             body.add("inertial", pos=joint.com, mass=joint.mass, fullinertia=joint.inertia)
             self._joints.append(
                 body.add(
-                    "joint", name=joint.name, type="hinge", axis=(0, 0, 1), range=(joint.lower, joint.upper), limited=True,
-                    damping=1.0, armature=0.1, actuatorfrcrange=(-torque, torque), actuatorfrclimited=True,
+                    "joint", name=joint.name, type="hinge", axis=(0, 0, 1), range=(joint.lower, joint.upper),
+                    limited=True, damping=1.0, armature=0.1, actuatorfrcrange=(-torque, torque), actuatorfrclimited=True,
                 )
             )  # fmt: skip
             body.add("geom", type="capsule", fromto=(*start, *end), size=(radius,))
@@ -129,6 +129,8 @@ class Panda(composer.Entity):
             "geom", name="palm", type="box", pos=(0, 0, 0.033), size=(0.022, 0.1, 0.033), rgba=(0.16, 0.17, 0.2, 1),
             contype=1, conaffinity=1,
         )  # fmt: skip
+        # Where LIBERO's eye-in-hand camera sits: looks along the fingers.
+        hand.add("camera", name="wrist", pos=(0.05, 0, 0), quat=(0, 0.707108, 0.707108, 0), fovy=75)
         hand.add("site", name="tcp", pos=(0, 0, TCP_FROM_HAND), size=(0.004,), rgba=(0, 0, 0, 0))
         for side, sign in (("left", 1), ("right", -1)):
             finger = hand.add("body", name=f"{side}_finger", pos=(0, 0, 0.0584), gravcomp=1)

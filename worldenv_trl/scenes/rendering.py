@@ -4,20 +4,35 @@ from __future__ import annotations
 
 import atexit
 import copy
+import importlib
 import os
 import queue
 import threading
 import weakref
 from collections.abc import Callable, Sequence
 
-import mujoco
 import numpy as np
 
-Paint = Callable[[mujoco.MjModel, np.ndarray], None]
+_BACKEND = os.environ.get("MUJOCO_GL", "the default")
 _REMEDY = (
     "install Debian's libegl1, libgl1-mesa-dri and libosmesa6 (bash .ci/install does), "
-    "and set MUJOCO_GL=egl or MUJOCO_GL=osmesa before Python starts"
+    "and set MUJOCO_GL=egl or MUJOCO_GL=osmesa before Python starts (MUJOCO_GL=off does without images)"
 )
+
+try:
+    import mujoco
+    from dm_control import composer  # noqa: F401 - loads GL as well, and fails where it cannot
+    from mujoco.rendering.classic import gl_context
+
+    if _BACKEND in ("egl", "osmesa") and "glfw" in gl_context.GLContext.__module__:
+        # MuJoCo was imported (TorchRL does) before this package chose a backend, and took the one that needs a display.
+        gl_context.GLContext = importlib.import_module(f"mujoco.{_BACKEND}").GLContext
+except ModuleNotFoundError:
+    raise
+except (ImportError, AttributeError, RuntimeError) as error:
+    raise ImportError(f"GL cannot be loaded with MUJOCO_GL={_BACKEND!r} ({error}): {_REMEDY}") from error
+
+Paint = Callable[[mujoco.MjModel, np.ndarray], None]
 
 
 class RendererPool:
@@ -60,9 +75,8 @@ class RendererPool:
         atexit.register(self._close)
         if errors:
             self._close()
-            backend = os.environ.get("MUJOCO_GL", "the default")
             raise RuntimeError(
-                f"no image can be rendered with MUJOCO_GL={backend!r} ({errors[0]}): {_REMEDY}"
+                f"no image can be rendered with MUJOCO_GL={_BACKEND!r} ({errors[0]}): {_REMEDY}"
             ) from errors[0]
 
     def render(self, qpos: np.ndarray, mocap_pos: np.ndarray) -> dict[str, np.ndarray]:

@@ -21,14 +21,15 @@ _POSITIONS = mujoco.mjtStage.mjSTAGE_POS.value
 class SceneBatch:
     """``num_envs`` simulations of a task.
 
-    Fields read after ``reset`` and ``step`` are those of the current state, not one substep old. Rows never influence one
-    another: a row's trajectory depends on its own state and actions only, bit for bit, whatever the batch and the threads.
+    Fields read after ``reset`` and ``step`` are those of the current state, not one substep old. Rows never influence
+    one another: a row's trajectory depends on its own state and actions only, bit for bit, whatever the batch and the
+    threads.
 
     Args:
         task: the task.
         num_envs: number of rows ``n``.
         image_size: height and width (px), at least 16.
-        cameras: cameras to render, or none.
+        cameras: cameras to render (``agentview``, ``wrist``), or none.
         num_threads: threads for physics and rendering; default: one per core, two at most.
 
     Raises:
@@ -51,7 +52,7 @@ class SceneBatch:
             raise ValueError(f"image_size must be at least 16 px, got {image_size}")
         self.task, self.num_envs, self.image_size = task, num_envs, image_size
         self.model = task.build()
-        known = [self.model.camera(i).name for i in range(self.model.ncam)]
+        known = {_short_name(full): full for full in (self.model.camera(i).name for i in range(self.model.ncam))}
         for name in cameras:
             if name not in known:
                 raise ValueError(f"unknown camera {name!r}: {task.name} has {', '.join(known)}")
@@ -68,9 +69,10 @@ class SceneBatch:
         self._mocap_pos = self.batch.bind("mocap_pos")
         self.xpos, self.xmat = self.batch.bind("xpos"), self.batch.bind("xmat")
         self.site_xpos, self.site_xmat = self.batch.bind("site_xpos"), self.batch.bind("site_xmat")
-        self.renderers = (
-            RendererPool(self.model, cameras, image_size, min(threads, num_envs), task.paint) if cameras else None
-        )
+        self.cameras, self.renderers = tuple(cameras), None
+        if cameras:
+            names = [known[name] for name in cameras]
+            self.renderers = RendererPool(self.model, names, image_size, min(threads, num_envs), task.paint)
 
     def reset(self, rows: np.ndarray, sim_state: np.ndarray) -> None:
         """Puts ``rows [k]`` into integration states ``sim_state [k, S]``, exactly.
@@ -81,7 +83,8 @@ class SceneBatch:
         rows, sim_state = np.asarray(rows, np.int32), np.asarray(sim_state, np.float64)
         if sim_state.shape != (len(rows), self.batch.nstate):
             raise ValueError(
-                f"sim_state must be [{len(rows)}, {self.batch.nstate}] for {self.task.name}, got {list(sim_state.shape)}"
+                f"sim_state must be [{len(rows)}, {self.batch.nstate}] for {self.task.name}, "
+                f"got {list(sim_state.shape)}"
             )
         if np.isnan(sim_state).any():
             raise ValueError(f"sim_state for {self.task.name} holds NaN")
@@ -90,7 +93,7 @@ class SceneBatch:
             self._make_current(rows)
 
     def step(self, action: np.ndarray, active: np.ndarray | None = None) -> None:
-        """One 20 Hz control step with ``action [n, 7]``; rows that are not ``active [n]`` keep their state bit for bit."""
+        """One 20 Hz control step with ``action [n, 7]``; rows not ``active [n]`` keep their state bit for bit."""
         rows = np.arange(self.num_envs) if active is None else np.flatnonzero(active)
         if not len(rows):
             return
@@ -112,7 +115,8 @@ class SceneBatch:
         if self.renderers is None:
             return {}
         rows = slice(None) if rows is None else rows
-        return self.renderers.render(self.qpos[rows], self._mocap_pos[rows])
+        images = self.renderers.render(self.qpos[rows], self._mocap_pos[rows])
+        return dict(zip(self.cameras, images.values(), strict=True))
 
     def measured_state(self) -> np.ndarray:
         """Hand position (m), axis-angle (rad) and gripper opening as they are, ``[n, 7]`` float32."""
@@ -141,6 +145,10 @@ class SceneBatch:
         if self.renderers is not None:
             self.renderers.close()
             self.renderers = None
+
+
+def _short_name(camera: str) -> str:
+    return camera.removeprefix("panda/")
 
 
 def _joint_address(model: mujoco.MjModel, name: str) -> int:
