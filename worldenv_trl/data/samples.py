@@ -1,43 +1,43 @@
-"""Training samples of the policy."""
+"""Behaviour-cloning samples: every executed step of an episode with the chunk of actions that follows."""
 
 from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from worldenv_trl import keys
+from worldenv_trl.keys import ACTION_IS_PAD, CHUNK, CHUNK_LENGTH, IMAGE, STATE, TASK_ID
 
 __all__ = ["policy_samples"]
 
 
-def policy_samples(episodes: TensorDictBase, chunk_length: int = keys.CHUNK_LENGTH) -> TensorDict:
-    """One sample for every executed step: what was seen, and the chunk of actions that followed.
+def policy_samples(episodes: TensorDictBase, chunk_length: int = CHUNK_LENGTH) -> TensorDict:
+    """One sample for each executed step of ``episodes`` [R] (:func:`~worldenv_trl.data.episodes_from_rollouts`).
 
-    Args:
-        episodes: ``[R]``, see :func:`episodes_from_rollouts`.
-        chunk_length: ``C``.
-
-    Returns:
-        TensorDict ``[N]`` with image, state, task id, ``("vla_action", "chunk")`` [N, C, 7] and ``action_is_pad`` bool
-        [N, C]: past the end of an episode the last action is repeated and marked.
+    Returns a TensorDict [N], episode after episode: ``("observation", "image")`` uint8 [N, 3, H, W],
+    ``("observation", "state")`` [N, 7], ``task_id`` [N, 1], ``("vla_action", "chunk")`` [N, C, 7] with the actions from
+    this step on, and ``action_is_pad`` bool [N, C], True past the end of the episode, where the last action repeats.
 
     Raises:
-        ValueError: if there are no episodes, or the chunk is empty.
+        ValueError: for a chunk shorter than one step, or episodes in which nothing was executed.
     """
     if chunk_length < 1:
         raise ValueError(f"chunk_length must be at least 1, got {chunk_length}")
-    if not len(episodes):
-        raise ValueError("there are no episodes to make samples of")
     length = episodes["length"]  # [R, 1]
-    row, step = (torch.arange(episodes["actions"].shape[1]) < length).nonzero(as_tuple=True)
-    wanted = step.unsqueeze(-1) + torch.arange(chunk_length)  # [N, C]
-    last = length[row] - 1
+    steps = torch.arange(episodes["actions"].shape[1], device=length.device)
+    episode, step = (steps < length).nonzero(as_tuple=True)
+    if not len(episode):
+        raise ValueError(f"the {len(episodes)} episodes hold no executed step to learn from")
+    wanted = step.unsqueeze(-1) + torch.arange(chunk_length, device=step.device)  # [N, C]
+    end = length[episode]
+    chunk = episodes["actions"][episode.unsqueeze(-1), torch.minimum(wanted, end - 1)]
     return TensorDict(
         {
-            "observation": {"image": episodes["frames"][row, step], "state": episodes["states"][row, step]},
-            keys.TASK_ID: episodes[keys.TASK_ID][row],
-            "vla_action": {"chunk": episodes["actions"][row.unsqueeze(-1), torch.minimum(wanted, last)]},
-            keys.ACTION_IS_PAD: wanted > last,
+            IMAGE: episodes["frames"][episode, step],
+            STATE: episodes["states"][episode, step],
+            TASK_ID: episodes[TASK_ID][episode],
+            CHUNK: chunk,
+            ACTION_IS_PAD: wanted >= end,
         },
-        batch_size=[len(row)],
+        batch_size=[len(episode)],
+        device=episodes.device,
     )

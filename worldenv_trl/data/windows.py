@@ -1,4 +1,4 @@
-"""Training windows of the world model."""
+"""Training windows of the world model: what it remembers at a step, what the hand will do, what will be seen."""
 
 from __future__ import annotations
 
@@ -6,32 +6,105 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from worldenv_trl import keys
-from worldenv_trl.data.episodes import predicted_states
+from worldenv_trl.keys import ACTION_DIM, TASK_ID
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.world_models import VideoWorldModel
 
-__all__ = ["WindowSampler", "imagine_episodes"]
+__all__ = ["WindowSampler", "predicted_poses", "world_model_windows"]
 
-_PADDED_ACTION_DIM = 14
+_PADDED_ACTION_DIM = 14  # the world model's dual-arm interface; a single arm fills the first seven
+
+
+@torch.no_grad()
+def predicted_poses(episodes: TensorDictBase, kinematics: ForwardKinematics) -> Tensor:
+    """Poses [R, T + 1, 13] of the hand, predicted open loop from each episode's first kinematic state and its actions.
+
+    These, not the measured ones, condition the world model: in imagination there is nothing to measure (World-Env
+    section 3.2). Past the end of an episode the hand holds still.
+    """
+    first = episodes["kinematic_states"][:, 0]
+    after = kinematics.rollout(first, episodes["actions"])
+    return kinematics.pose(torch.cat([first.unsqueeze(1), after], 1))
+
+
+def world_model_windows(
+    episodes: TensorDictBase,
+    poses: Tensor,
+    world_model: VideoWorldModel,
+    episode: Tensor,
+    start: Tensor,
+    *,
+    chunks: int = 2,
+) -> TensorDict:
+    """The windows of ``chunks`` consecutive chunks that begin at the given frames: the input of ``DiffusionLoss``.
+
+    Args:
+        episodes: TensorDict [R], see :func:`~worldenv_trl.data.episodes_from_rollouts`.
+        poses: [R, T + 1, 13], see :func:`predicted_poses`.
+        world_model: its ``memory_indices`` says which frames are remembered, its ``chunk_length`` is C.
+        episode: int64 [B], which episode.
+        start: int64 [B], the frame t after which the window begins; 0 is the reset.
+
+    Returns a TensorDict [B]: ``("memory", "frames")`` uint8 [B, M, 3, H, W], ``("memory", "poses")`` [B, M, 13],
+    ``("memory", "reference")`` uint8 [B, 3, H, W] (the episode's first frame), ``poses`` [B, n C, 13],
+    ``padded_actions`` [B, n C, 14], ``target_frames`` uint8 [B, n C, 3, H, W], ``target_mask`` bool [B, n C] (False
+    past the end of the episode, where the last frame repeats) and ``task_id`` [B, 1].
+
+    Raises:
+        ValueError: for a start outside its episode.
+    """
+    length = episodes["length"][episode].squeeze(-1)  # [B]
+    outside = (start < 0) | (start > length)
+    if bool(outside.any()):
+        row = int(outside.nonzero()[0])
+        raise ValueError(
+            f"a window starts at frame {int(start[row])} of episode {int(episode[row])}, which has frames 0 to "
+            f"{int(length[row])}"
+        )
+    rows = episode.unsqueeze(-1)
+    memory = world_model.memory_indices(start)
+    step = start.unsqueeze(-1) + torch.arange(chunks * world_model.chunk_length, device=start.device)  # [B, n C]
+    end = length.unsqueeze(-1)
+    seen = torch.minimum(step + 1, end)
+    inside = step < end
+    actions = episodes["actions"][rows, step.clamp(max=episodes["actions"].shape[1] - 1)] * inside.unsqueeze(-1)
+    frames = episodes["frames"]
+    return TensorDict(
+        {
+            "memory": {
+                "frames": frames[rows, memory],
+                "poses": poses[rows, memory],
+                "reference": frames[episode, 0],
+            },
+            "poses": poses[rows, seen],
+            "padded_actions": torch.nn.functional.pad(actions, (0, _PADDED_ACTION_DIM - ACTION_DIM)),
+            "target_frames": frames[rows, seen],
+            "target_mask": inside,
+            TASK_ID: episodes[TASK_ID][episode],
+        },
+        batch_size=[len(episode)],
+        device=frames.device,
+    )
 
 
 class WindowSampler:
-    """Random windows of episodes: the memory at a step, and the two chunks that follow.
+    """Draws windows of the episodes, every frame that leaves room for a chunk being as likely a start as any other.
 
-    Poses are those that FK predicts from the episode's first state, as in imagination, never the true ones.
+    Only a window that starts at the reset shows the first frame being left, while imagination starts there every time:
+    a share of the windows starts there on purpose.
 
     Args:
-        episodes: ``[R]``, see :func:`episodes_from_rollouts`.
-        kinematics: FK(s, a).
-        world_model: says which frames it remembers.
+        episodes: TensorDict [R] of at least one executed step.
+        kinematics: FK(s, a); poses are predicted once, here.
+        world_model: the model to train.
 
     Keyword Args:
         chunks: consecutive chunks in a window.
-        seed: of the draws.
+        reset_share: share of windows that start at an episode's first frame; default: one decision in eight.
+        seed: of the draws; from torch's generator when None.
 
     Raises:
-        ValueError: if there are no episodes.
+        ValueError: for episodes without a step, frames of another size than the model's, or settings out of range.
     """
 
     def __init__(
@@ -41,99 +114,38 @@ class WindowSampler:
         world_model: VideoWorldModel,
         *,
         chunks: int = 2,
-        seed: int = 0,
+        reset_share: float = 0.125,
+        seed: int | None = None,
     ) -> None:
-        if not len(episodes):
-            raise ValueError("there are no episodes to train a world model on")
-        self.episodes, self.world_model, self.chunks = episodes, world_model, chunks
-        self.poses = kinematics.pose(predicted_states(episodes, kinematics))  # [R, L+1, 13]
-        self._starts = (torch.arange(episodes["actions"].shape[1]) < episodes["length"]).nonzero()
-        self._generator = torch.Generator().manual_seed(seed)
+        if chunks < 1:
+            raise ValueError(f"chunks must be at least 1, got {chunks}")
+        if not 0 <= reset_share <= 1:
+            raise ValueError(f"reset_share must lie between 0 and 1, got {reset_share}")
+        length = episodes["length"].squeeze(-1)
+        if not len(episodes) or not bool(length.any()):
+            raise ValueError(f"the {len(episodes)} episodes hold no executed step: there is no window to draw")
+        size, frames = world_model.config.image_size, episodes["frames"]
+        if tuple(frames.shape[2:]) != (3, size, size):
+            raise ValueError(f"the world model sees {size} px images, the episodes' are {tuple(frames.shape[2:])}")
+        self.episodes, self.world_model = episodes, world_model
+        self.chunks, self.reset_share = chunks, reset_share
+        self.poses = predicted_poses(episodes, kinematics)
+        starts = ((length - world_model.chunk_length).clamp(min=0) + 1) * (length > 0)  # [R]
+        self._ends = starts.cumsum(0)  # the windows, numbered episode by episode
+        self._starts = starts
+        self._generator = torch.Generator()
+        self._generator.manual_seed(int(torch.randint(2**31, ()).item()) if seed is None else seed)
+
+    def __len__(self) -> int:
+        """Distinct windows."""
+        return int(self._ends[-1])
 
     def sample(self, batch_size: int) -> TensorDict:
-        """``batch_size`` windows as :class:`~worldenv_trl.objectives.DiffusionLoss` reads them."""
-        drawn = torch.randint(len(self._starts), (batch_size,), generator=self._generator)
-        row, step = self._starts[drawn].unbind(-1)
-        length = self.chunks * self.world_model.chunk_length
-        ahead = step.unsqueeze(-1) + torch.arange(1, length + 1)  # [B, n C]: frames o_{t+1} to o_{t+n C}
-        end = self.episodes["length"][row]
-        frame = torch.minimum(ahead, end)
-        here = row.unsqueeze(-1)
-        memory = self.world_model.memory_indices(step)
-        actions = self.episodes["actions"][here, torch.minimum(ahead - 1, end - 1)]
-        return TensorDict(
-            {
-                "memory": {
-                    "frames": self.episodes["frames"][here, memory],
-                    "poses": self.poses[here, memory],
-                    "reference": self.episodes["frames"][row, 0],
-                },
-                "poses": self.poses[here, frame],
-                "padded_actions": _padded(actions),
-                "target_frames": self.episodes["frames"][here, frame],
-                "target_mask": ahead <= end,
-                keys.TASK_ID: self.episodes[keys.TASK_ID][row],
-            },
-            batch_size=[batch_size],
-        )
-
-
-@torch.no_grad()
-def imagine_episodes(
-    world_model: VideoWorldModel, episodes: TensorDictBase, kinematics: ForwardKinematics, *, rows_at_once: int = 64, seed: int = 0
-) -> TensorDict:
-    """The same actions from the same first frames, imagined open loop on the model's own frames.
-
-    Args:
-        world_model: paints chunks of ``C`` frames.
-        episodes: ``[R]``.
-        kinematics: FK(s, a).
-
-    Keyword Args:
-        rows_at_once: episodes in memory at a time.
-        seed: of the model's noise, for each episode and chunk.
-
-    Returns:
-        ``episodes`` with ``frames`` uint8 [R, L+1, 3, H, W] imagined (the first is real) and ``kinematic_states``
-        predicted; success stays that of the physics under the same actions.
-    """
-    parts = [
-        _imagine(world_model, episodes[start : start + rows_at_once], kinematics, seed + start)
-        for start in range(0, len(episodes), rows_at_once)
-    ]
-    out = episodes.clone(False)
-    out["frames"] = torch.cat([frames for frames, _ in parts])
-    out["kinematic_states"] = torch.cat([states for _, states in parts])
-    return out
-
-
-def _imagine(world_model: VideoWorldModel, episodes: TensorDictBase, kinematics: ForwardKinematics, seed: int) -> tuple[Tensor, Tensor]:
-    rows, steps = episodes["actions"].shape[:2]
-    chunk = world_model.chunk_length
-    states = predicted_states(episodes, kinematics)
-    poses = kinematics.pose(states)
-    spare = -(-steps // chunk) * chunk - steps  # the last chunk may reach past the end
-    poses = torch.cat([poses, poses[:, -1:].expand(-1, spare, -1)], 1)
-    actions = torch.nn.functional.pad(episodes["actions"], (0, 0, 0, spare))
-    video = episodes["frames"].new_zeros(rows, steps + spare + 1, *episodes["frames"].shape[2:])
-    video[:, 0] = episodes["frames"][:, 0]
-    here = torch.arange(rows).unsqueeze(-1)
-    for start in range(0, steps, chunk):
-        memory = world_model.memory_indices(torch.full((rows,), start))
-        request = TensorDict(
-            {
-                "memory": {"frames": video[here, memory], "poses": poses[here, memory], "reference": video[:, 0]},
-                "poses": poses[:, start + 1 : start + chunk + 1],
-                "padded_actions": _padded(actions[:, start : start + chunk]),
-                keys.TASK_ID: episodes[keys.TASK_ID],
-                "noise_seed": (seed + torch.arange(rows).unsqueeze(-1)) * 1009 + start,
-            },
-            batch_size=[rows],
-        )
-        video[:, start + 1 : start + chunk + 1] = world_model(request)[keys.FRAMES]
-    return video[:, : steps + 1], states
-
-
-def _padded(actions: Tensor) -> Tensor:
-    """Actions [..., 7] in the dual-arm interface [..., 14]; the second arm is idle."""
-    return torch.nn.functional.pad(actions, (0, _PADDED_ACTION_DIM - actions.shape[-1]))
+        """``batch_size`` windows, with replacement; see :func:`world_model_windows`."""
+        number = torch.randint(len(self), (batch_size,), generator=self._generator)
+        at_reset = torch.rand(batch_size, generator=self._generator) < self.reset_share
+        number, at_reset = number.to(self._ends.device), at_reset.to(self._ends.device)
+        episode = torch.searchsorted(self._ends, number, right=True)
+        start = number - (self._ends - self._starts)[episode]
+        start = start.masked_fill(at_reset, 0)
+        return world_model_windows(self.episodes, self.poses, self.world_model, episode, start, chunks=self.chunks)
