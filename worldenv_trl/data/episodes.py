@@ -161,7 +161,7 @@ def _compaction(valid: Tensor) -> tuple[Tensor, Tensor]:
     Indices past the number repeat the last executed step.
     """
     length = valid.sum(-1, keepdim=True)
-    order = (~valid).to(torch.uint8).argsort(-1, stable=True)
+    order = (~valid).to(torch.uint8).argsort(dim=-1, stable=True)
     place = torch.arange(valid.shape[-1], device=valid.device).expand_as(order)
     return order.gather(-1, torch.minimum(place, (length - 1).clamp(min=0))), length
 
