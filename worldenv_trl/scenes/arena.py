@@ -25,6 +25,7 @@ class TabletopArena:
         # Round shapes cost by their facets, and shadows cost most of all (software GL).
         root.visual.quality.set_attributes(numslices=10, numstacks=6, numquads=1, shadowsize=0)
         root.visual.map.znear = 0.02
+        root.statistic.extent = 1.0  # the unit of znear: the wrist camera looks from 10 cm
         root.visual.headlight.set_attributes(ambient=(0.45, 0.45, 0.45), diffuse=(0.45, 0.45, 0.45), specular=(0, 0, 0))
         root.worldbody.add(
             "light",

@@ -119,7 +119,8 @@ class Panda(composer.Entity):
             self._joints.append(
                 body.add(
                     "joint", name=joint.name, type="hinge", axis=(0, 0, 1), range=(joint.lower, joint.upper),
-                    limited=True, damping=1.0, armature=0.1, actuatorfrcrange=(-torque, torque), actuatorfrclimited=True,
+                    limited=True, damping=1.0, armature=0.1, actuatorfrclimited=True,
+                    actuatorfrcrange=(-torque, torque),
                 )
             )  # fmt: skip
             body.add("geom", type="capsule", fromto=(*start, *end), size=(radius,))
