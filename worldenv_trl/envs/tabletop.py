@@ -222,6 +222,11 @@ class TabletopEnv(EnvBase):
     def num_envs(self) -> int:
         return self.batch_size[0]
 
+    @property
+    def scenes(self) -> list[tuple[SceneBatch, np.ndarray]]:
+        """The simulation of each task and the rows of the env it runs: privileged state, for experts and checks."""
+        return [(block.scene, block.rows) for block in self._blocks]
+
     # ------------------------------------------------------------------------------------------------- reset
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
