@@ -90,7 +90,7 @@ class SceneBatch:
             raise ValueError(f"sim_state for {self.task.name} holds NaN")
         if len(rows):
             self.batch.state[rows] = sim_state
-            self._make_current(rows)
+            self._make_current(np.unique(rows))  # the batch takes sorted rows only
 
     def step(self, action: np.ndarray, active: np.ndarray | None = None) -> None:
         """One 20 Hz control step with ``action [n, 7]``; rows not ``active [n]`` keep their state bit for bit."""
