@@ -20,7 +20,7 @@ CAMERA = SimpleNamespace(
 
 def make_model(**settings) -> VideoWorldModel:
     torch.manual_seed(0)
-    small = {"image_size": 32, "width": 16, "multipliers": (1, 2), "blocks": (1, 1), "frame_channels": 8}
+    small = {"image_size": 32, "patch": 2, "width": 16, "multipliers": (1, 2), "blocks": (1, 1), "frame_channels": 8}
     return VideoWorldModel(VideoWorldModelConfig.for_cameras({0: CAMERA}, **small, **settings))
 
 

@@ -16,7 +16,7 @@ CAMERA = SimpleNamespace(
     rotation=((0.0, -0.5547, 0.83205), (1.0, 0.0, 0.0), (0.0, 0.83205, 0.5547)),
     fovy_deg=45.0,
 )
-SMALL = {"image_size": 32, "width": 16, "multipliers": (1, 2), "blocks": (1, 1), "frame_channels": 8}
+SMALL = {"image_size": 32, "patch": 2, "width": 16, "multipliers": (1, 2), "blocks": (1, 1), "frame_channels": 8}
 
 
 @pytest.fixture(scope="module")

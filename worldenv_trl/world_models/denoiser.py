@@ -27,8 +27,9 @@ class Denoiser(nn.Module):
     """Predicts the clean chunk x_0 from a noisy one, the remembered frames and the hand's path.
 
     A small UNet over the whole chunk works at ``1 / patch`` of the resolution. Every frame passes through one shared
-    encoder before it and one shared decoder after it, so that the trunk alone pays for time. For every pixel of every
-    frame the decoder chooses, by a softmax, between
+    encoder before it and one shared decoder after it, so that the trunk alone pays for time. The encoder sees where
+    every cell lies relative to the tool and is modulated by the frame's pose: an implicit image of the arm, whose looks
+    depend on its pose alone. For every pixel of every frame the decoder chooses, by a softmax, between
 
     - the last frame (a static pixel is an exact copy: free and sharp),
     - the first frame (what the arm uncovers),
@@ -47,7 +48,8 @@ class Denoiser(nn.Module):
         image_size: side in pixels.
         patch: pixels per cell of the network's finest grid.
         map_channels: channels of the action maps, drawn on the finest grid.
-        condition_dim: size of the vector condition.
+        pose_dim: size of the pose of a frame.
+        condition_dim: size of the vector condition of the chunk.
         width: channels of the finest level.
         multipliers: channels of every level, in units of ``width``.
         blocks: residual blocks of every level, on the way down and again on the way up.
@@ -63,6 +65,7 @@ class Denoiser(nn.Module):
         image_size: int,
         patch: int,
         map_channels: int,
+        pose_dim: int,
         condition_dim: int,
         width: int,
         multipliers: tuple[int, ...],
@@ -73,7 +76,7 @@ class Denoiser(nn.Module):
         super().__init__()
         self.chunk_length, self.patch = chunk_length, patch
         cell = 3 * patch**2
-        maps = map_channels + 2
+        maps = map_channels
         widths = [width * factor for factor in multipliers]
 
         self.condition = nn.Sequential(nn.Linear(condition_dim, embedding_dim), nn.SiLU())
@@ -83,6 +86,8 @@ class Denoiser(nn.Module):
 
         self.memory_in = nn.Conv2d(memory_frames * (cell + maps), width, 3, padding=1)
         self.frame_in = nn.Conv2d(cell + maps, frame_channels, 3, padding=1)
+        self.frame_mid = nn.Conv2d(frame_channels, frame_channels, 3, padding=1)
+        self.pose = nn.Sequential(nn.Linear(pose_dim, 64), nn.SiLU(), nn.Linear(64, 4 * frame_channels))
         self.noisy_in = nn.Conv2d(cell, frame_channels, 3, padding=1, bias=False)
         self.merge = nn.Conv2d(chunk_length * frame_channels, width, 1)
 
@@ -116,6 +121,7 @@ class Denoiser(nn.Module):
         memory_maps: Tensor,
         maps: Tensor,
         motion: Tensor,
+        poses: Tensor,
         condition: Tensor,
         reference: Tensor,
         frames: Tensor | None = None,
@@ -126,10 +132,11 @@ class Denoiser(nn.Module):
             noisy: [B, C, 3, P, h, w], the noisy chunk, or None for zeros (which cost nothing).
             noise_level: [B], 0 is pure noise (or nothing known), 1 is clean.
             memory: [B, M, 3, H, W].
-            memory_maps: [B, M, K + 2, h, w], action maps and tool coordinates of the remembered frames.
-            maps: [B, C, K + 2, h, w], the same of the frames to paint.
+            memory_maps: [B, M, K, h, w], action maps and tool coordinates of the remembered frames.
+            maps: [B, C, K, h, w], the same of the frames to paint.
             motion: [B, C, 2], the tool's motion on the image since the last frame, in pixels.
-            condition: [B, D], poses and actions.
+            poses: [B, C, D'], the pose of every frame to paint.
+            condition: [B, D], poses and actions of the whole chunk.
             reference: [B, 3, H, W].
             frames: int64 [F], which frames of the chunk to paint, or None for all. The trunk always sees the whole
                 chunk; leaving frames out saves the decoder's share.
@@ -150,7 +157,9 @@ class Denoiser(nn.Module):
         if noisy is not None:
             noisy = noisy.flatten(2, 3).flatten(0, 1).contiguous(memory_format=torch.channels_last)
             per_frame = per_frame + self.noisy_in(noisy)
-        per_frame = F.silu(per_frame)
+        modulation = self.pose(poses.flatten(0, 1))[..., None, None].chunk(4, 1)
+        per_frame = F.silu(torch.addcmul(modulation[0], per_frame, 1 + modulation[1]))
+        per_frame = F.silu(torch.addcmul(modulation[2], self.frame_mid(per_frame), 1 + modulation[3]))
         inputs = torch.cat([remembered.flatten(2, 3), memory_maps], 2).flatten(1, 2)
         trunk = self.memory_in(inputs.contiguous(memory_format=torch.channels_last))
         trunk = trunk + self.merge(_frames_to_channels(per_frame, chunk))

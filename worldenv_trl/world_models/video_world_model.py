@@ -42,12 +42,12 @@ class VideoWorldModelConfig:
     chunk_length: int = CHUNK_LENGTH
     memory_stride: int = 4
     """The middle memory frame is this many frames older than the last."""
-    patch: int = 2
+    patch: int = 4
     """Pixels per cell of the network's finest grid."""
-    width: int = 48
-    multipliers: tuple[int, ...] = (1, 2, 3)
-    blocks: tuple[int, ...] = (1, 2, 2)
-    frame_channels: int = 16
+    width: int = 96
+    multipliers: tuple[int, ...] = (1, 2)
+    blocks: tuple[int, ...] = (2, 2)
+    frame_channels: int = 32
     embedding_dim: int = 192
     num_denoise_steps: int = 1
     deterministic: bool = True
@@ -135,8 +135,9 @@ class VideoWorldModel(TensorDictModuleBase, Pretrained):
             memory_frames=_MEMORY,
             image_size=config.image_size,
             patch=config.patch,
-            map_channels=ActionMap.channels,
-            condition_dim=(_MEMORY + chunk) * POSE_DIM + 3 + chunk * PADDED_ACTION_DIM,
+            map_channels=ActionMap.channels + 4,
+            pose_dim=POSE_DIM + 3,
+            condition_dim=(_MEMORY + chunk) * (POSE_DIM + 3) + chunk * PADDED_ACTION_DIM,
             width=config.width,
             multipliers=config.multipliers,
             blocks=config.blocks,
@@ -194,12 +195,14 @@ class VideoWorldModel(TensorDictModuleBase, Pretrained):
             pixels = self.action_map.project(every[..., :3], task_id)  # cells of the finest grid
             maps = torch.cat([self.action_map(every, task_id), self._tool_coordinates(pixels)], 2)
         motion = (pixels[:, _MEMORY:] - pixels[:, _MEMORY - 1 : _MEMORY]) * self.config.patch
+        vectors = self._pose_vectors(every)
         return {
             "memory": to_float(tensordict[MEMORY_FRAMES]),
             "memory_maps": maps[:, :_MEMORY],
             "maps": maps[:, _MEMORY:],
             "motion": motion.clamp(-self.config.image_size, self.config.image_size),
-            "condition": self._vector(every, tensordict[PADDED_ACTIONS].float()),
+            "poses": vectors[:, _MEMORY:],
+            "condition": torch.cat([vectors.flatten(1), tensordict[PADDED_ACTIONS].float().flatten(1)], -1),
             "reference": to_float(tensordict[REFERENCE]),
         }
 
@@ -220,19 +223,21 @@ class VideoWorldModel(TensorDictModuleBase, Pretrained):
         return self.config.precision == "bfloat16"
 
     def _tool_coordinates(self, pixels: Tensor) -> Tensor:
-        """Every cell's offset from the tool, saturating at a third of the image: [*B, 2] -> [*B, 2, h, w]."""
+        """Every cell's offset from the tool, saturating far and, once more, near it: [*B, 2] -> [*B, 4, h, w]."""
         side = self.action_map.height
         axis = torch.arange(side, device=pixels.device, dtype=torch.float32) + 0.5
-        offset = torch.tanh((axis - pixels.unsqueeze(-1)) * (3 / side))  # [*B, 2, side]
-        across = offset[..., 0, None, :].expand(*pixels.shape[:-1], side, side)
-        down = offset[..., 1, :, None].expand(*pixels.shape[:-1], side, side)
-        return torch.stack([across, down], -3)
+        offset = (axis - pixels.unsqueeze(-1)) / side  # [*B, 2, side]
+        offset = torch.cat([torch.tanh(3 * offset), torch.tanh(12 * offset)], -2)
+        across = offset[..., ::2, None, :].expand(*pixels.shape[:-1], 2, side, side)
+        down = offset[..., 1::2, :, None].expand(*pixels.shape[:-1], 2, side, side)
+        return torch.cat([across, down], -3)
 
-    def _vector(self, poses: Tensor, actions: Tensor) -> Tensor:
-        """Positions relative to the last frame's, rotations, openings and actions: [B, D]."""
-        origin = poses[:, _MEMORY - 1 : _MEMORY, :3]
-        relative = torch.cat([(poses[..., :3] - origin) * _POSITION_SCALE, poses[..., 3:]], -1)
-        return torch.cat([relative.flatten(1), origin.squeeze(1), actions.flatten(1)], -1)
+    @staticmethod
+    def _pose_vectors(poses: Tensor) -> Tensor:
+        """Position since the last remembered frame, position, rotation, opening: [B, M + C, 13] -> [B, M + C, 16]."""
+        position = poses[..., :3] * _POSITION_SCALE
+        origin = position[:, _MEMORY - 1 : _MEMORY]
+        return torch.cat([position - origin, 0.3 * position, poses[..., 3:]], -1)
 
     def _check(self, tensordict: TensorDictBase) -> None:
         size, chunk = self.config.image_size, self.chunk_length
