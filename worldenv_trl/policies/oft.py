@@ -26,9 +26,9 @@ class OFTConfig:
     Args:
         instructions: the instruction of every task.
         task_ids: the ``task_id`` of every instruction; 0, 1, 2, ... when empty.
-        image_size: height and width of the images in pixels, a multiple of 8.
-        stem_widths: channels of the stem's stride-2 convolutions; ``dim`` is the last one's.
-        film: lets the instruction modulate the stem's features (OFT+, section 3.4), before the tokens mix.
+        image_size: height and width of the images in pixels, a multiple of 4.
+        stem_widths: channels of the stem's convolutions, at least two; the first two halve the image.
+        num_keypoints: image tokens.
         dim, depth, num_heads, mlp_ratio: the transformer.
         head_dim, head_blocks: the two MLPResNet heads.
         vocabulary: words; those of the instructions when empty. Other words become ``<unk>``.
@@ -41,10 +41,10 @@ class OFTConfig:
     chunk_length: int = CHUNK_LENGTH
     action_dim: int = ACTION_DIM
     state_dim: int = STATE_DIM
-    stem_widths: tuple[int, ...] = (32, 64)
-    film: bool = True
+    stem_widths: tuple[int, ...] = (32, 32, 48)
+    num_keypoints: int = 24
     dim: int = 128
-    depth: int = 3
+    depth: int = 2
     num_heads: int = 4
     mlp_ratio: int = 2
     head_dim: int = 256
@@ -65,9 +65,12 @@ class OFTConfig:
                 f"task_ids must be one distinct id for each of the {len(self.instructions)} instructions, "
                 f"got {self.task_ids}"
             )
-        stride = 2 ** (len(self.stem_widths) + 1)
-        if self.image_size < 16 or self.image_size % stride:
-            raise ValueError(f"image_size must be a multiple of {stride} px and at least 16, got {self.image_size}")
+        if self.image_size < 16 or self.image_size % 4:
+            raise ValueError(f"image_size must be a multiple of 4 px and at least 16, got {self.image_size}")
+        if len(self.stem_widths) < 2 or self.depth < 1:
+            raise ValueError(
+                f"stem_widths needs two entries and depth one at least, got {self.stem_widths}, {self.depth}"
+            )
         if self.dim % self.num_heads:
             raise ValueError(f"dim must be a multiple of num_heads={self.num_heads}, got {self.dim}")
         if not self.vocabulary:
@@ -124,48 +127,75 @@ class _Block(nn.Module):
         return tokens + self.mlp_out(F.gelu(self.mlp_in(self.norm_mlp(tokens))))
 
 
+class _Keypoints(nn.Module):
+    """Image tokens: where something is, and what is there.
+
+    A convolutional stem, modulated by the instruction (FiLM, as in OFT+), gives one attention map per token. A token's
+    position is the map's mean (spatial softmax, arXiv:1504.00702), its content the features under the map
+    (TokenLearner, arXiv:2106.11297). Positions follow the objects by construction, so a few demonstrations teach a map
+    from positions to actions that holds between them; patch tokens have to learn that first.
+    """
+
+    def __init__(self, config: OFTConfig):
+        super().__init__()
+        widths = (3, *config.stem_widths)
+        self.stem = nn.ModuleList(
+            # Two halvings, then full resolution: the finer the maps, the finer the positions.
+            nn.Conv2d(fan_in, fan_out, 5 if i == 0 else 3, stride=2 if i < 2 else 1, padding=2 if i == 0 else 1)
+            for i, (fan_in, fan_out) in enumerate(itertools.pairwise(widths))
+        )
+        self.film = nn.Linear(config.dim, 2 * widths[-1])
+        nn.init.normal_(self.film.weight, std=0.1)
+        nn.init.zeros_(self.film.bias)
+        self.maps = nn.Conv2d(widths[-1], config.num_keypoints, 1)
+        self.log_sharpness = nn.Parameter(torch.ones(()))
+        side = torch.linspace(-1, 1, config.image_size // 4)
+        grid = torch.stack(torch.meshgrid(side, side, indexing="ij"), -1).flatten(0, 1)
+        self.register_buffer("grid", grid, persistent=False)  # [P, 2]: row, column
+        self.position = nn.Linear(2, config.dim)
+        self.content = nn.Linear(widths[-1], config.dim)
+        self.slot = nn.Parameter(torch.randn(config.num_keypoints, config.dim) * 0.2)
+
+    def forward(self, image: torch.Tensor, sentence: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """``[B, 3, H, W]``, ``[B, dim]`` -> tokens ``[B, K, dim]`` and their positions ``[B, K, 2]`` in [-1, 1]."""
+        features = image
+        for conv in self.stem[:-1]:
+            features = F.relu(conv(features))
+        gain, bias = self.film(sentence)[:, :, None, None].chunk(2, 1)
+        features = F.relu(self.stem[-1](features) * (1 + gain) + bias)
+        attention = (self.maps(features).flatten(2) * self.log_sharpness.exp()).softmax(-1)  # [B, K, P]
+        positions = attention @ self.grid
+        content = attention @ features.flatten(2).mT
+        return self.position(positions) + self.content(content) + self.slot, positions
+
+
 class _Backbone(nn.Module):
     """Image, instruction, proprioception and action queries in one bidirectional transformer."""
 
     def __init__(self, config: OFTConfig):
         super().__init__()
         self.config = config
-        widths = (3, *config.stem_widths, config.dim)
-        self.stem = nn.ModuleList(
-            nn.Conv2d(fan_in, fan_out, 5 if i == 0 else 3, stride=2, padding=2 if i == 0 else 1)
-            for i, (fan_in, fan_out) in enumerate(itertools.pairwise(widths))
-        )
         self.words = nn.Embedding(len(config.vocabulary), config.dim, padding_idx=0)
+        nn.init.normal_(self.words.weight, std=0.3)
         self.word_position = nn.Parameter(torch.randn(config.max_words, config.dim) * 0.02)
-        if config.film:
-            self.film = nn.ModuleList(nn.Linear(config.dim, 2 * width) for width in widths[1:])
-            for layer in self.film:
-                nn.init.normal_(layer.weight, std=0.02)
-                nn.init.zeros_(layer.bias)
-        patches = (config.image_size // 2 ** len(self.stem)) ** 2
-        self.patch_norm = nn.LayerNorm(config.dim)
-        self.patch_position = nn.Parameter(torch.randn(patches, config.dim) * 0.2)
+        self.keypoints = _Keypoints(config)
         self.proprio_in = nn.Linear(config.state_dim, config.dim)
         self.proprio_out = nn.Linear(config.dim, config.dim)
         self.queries = nn.Parameter(torch.randn(config.chunk_length, config.dim) * 0.2)
+        # Each query starts from a linear readout of all positions: with few data it beats leaving this to attention.
+        self.readout = nn.Linear(2 * config.num_keypoints + config.state_dim, config.chunk_length * config.dim)
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.depth))
         self.norm = nn.LayerNorm(config.dim)
 
     def forward(self, image: torch.Tensor, state: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
         """``image`` float ``[B, 3, H, W]``, ``state`` ``[B, S]``, ``words`` int ``[B, L]`` -> ``[B, C, dim]``."""
         padded = words == 0
-        text = self.words(words)  # [B, L, dim]
+        text = self.words(words) * ~padded[..., None]  # [B, L, dim]
         sentence = text.sum(1) / (~padded).sum(1, keepdim=True).clamp(min=1)
-        features = image
-        for i, conv in enumerate(self.stem):
-            features = conv(features)
-            if self.config.film:
-                gain, bias = self.film[i](sentence)[:, :, None, None].chunk(2, 1)
-                features = features * (1 + gain) + bias
-            features = F.gelu(features)
-        patches = self.patch_norm(features.flatten(2).mT) + self.patch_position  # [B, P, dim]
+        patches, positions = self.keypoints(image, sentence)
         proprio = self.proprio_out(F.gelu(self.proprio_in(state)))[:, None]
-        queries = self.queries.expand(image.shape[0], -1, -1)
+        readout = self.readout(torch.cat([positions.flatten(1), state], -1))
+        queries = self.queries + readout.unflatten(-1, self.queries.shape)
         tokens = torch.cat([text + self.word_position[: words.shape[1]], patches, proprio, queries], 1)
         pad = F.pad(padded, (0, tokens.shape[1] - words.shape[1]))[:, None, None]
         pad = torch.zeros_like(pad, dtype=tokens.dtype).masked_fill(pad, float("-inf"))
