@@ -25,7 +25,11 @@ _OPEN, _CLOSE = -1.0, 1.0
 
 @dataclass(frozen=True)
 class _Phase:
-    """Go to ``target(scene, memory) [n, 3]`` until within ``tolerance`` for ``dwell`` steps, or for ``limit`` steps at most; ``memory`` is set on entry."""
+    """Go to ``target(scene, memory) [n, 3]`` until within ``tolerance`` for ``dwell`` steps, or for ``limit`` at most.
+
+    ``remember(scene) [n, 3]`` is read once on entry and handed to ``target`` as its memory. A row where
+    ``still(scene) [n]`` is false has lost what it worked on and starts over.
+    """
 
     target: Callable[[SceneBatch, np.ndarray], np.ndarray]
     gripper: float
@@ -34,6 +38,7 @@ class _Phase:
     speed: float = 0.45
     limit: int = 14
     remember: Callable[[SceneBatch], np.ndarray] | None = None
+    still: Callable[[SceneBatch], np.ndarray] | None = None
 
 
 class ScriptedExpert:
@@ -87,9 +92,14 @@ class ScriptedExpert:
             self._dwell[arrived] += 1
             self._spent[rows] += 1
             ready = (arrived & (self._dwell >= phase.dwell)) | (rows & (self._spent >= phase.limit))
-            if index < len(self._phases) - 1:
-                following[ready] += 1
-                self._dwell[ready], self._spent[ready], self._memory[ready] = 0, 0, np.nan
+            if index == len(self._phases) - 1:
+                ready[:] = False
+            following[ready] += 1
+            if phase.still is not None:
+                lost = rows & ~phase.still(scene)
+                following[lost] = 0
+                ready |= lost
+            self._dwell[ready], self._spent[ready], self._memory[ready] = 0, 0, np.nan
         self._phase = following
         turn = controller.vector_from_rotation(_DOWN @ targets[:, 3:12].reshape(-1, 3, 3).swapaxes(1, 2))
         action[:, 3:6] = np.clip(turn / ROTATION_STEP, -0.3, 0.3)
@@ -105,14 +115,18 @@ def _put_on(bowl: str, plate: str) -> list[_Phase]:
         held = _tcp(scene) - _body(scene, bowl)
         return _body(scene, plate) + held + (0.0, 0.0, bottom)
 
-    grip = Bowl.HEIGHT - 0.014
+    def held(scene: SceneBatch) -> np.ndarray:
+        return np.linalg.norm(_tcp(scene) - _body(scene, bowl), axis=-1) < 2 * Bowl.RIM_RADIUS
+
+    # Deep enough that the pads carry the bowl level; slow at the end, so that it is set down rather than dropped.
+    grip = Bowl.HEIGHT - 0.022
     return [
         _Phase(lambda s, m: rim(s, 0.11), _OPEN, tolerance=0.025),
         _Phase(lambda s, m: rim(s, grip), _OPEN, tolerance=0.006),
         _Phase(lambda s, m: m, _CLOSE, tolerance=0.03, dwell=6, remember=lambda s: rim(s, grip)),
         _Phase(lambda s, m: m, _CLOSE, tolerance=0.02, remember=lambda s: _tcp(s) + (0.0, 0.0, 0.07)),
-        _Phase(lambda s, m: over_plate(s, 0.06), _CLOSE, tolerance=0.010),
-        _Phase(lambda s, m: over_plate(s, Plate.TOP - 0.001), _CLOSE, tolerance=0.005, speed=0.35),
+        _Phase(lambda s, m: over_plate(s, 0.06), _CLOSE, tolerance=0.010, still=held),
+        _Phase(lambda s, m: over_plate(s, Plate.TOP - 0.001), _CLOSE, tolerance=0.005, speed=0.2, still=held),
         _Phase(lambda s, m: m, _OPEN, tolerance=0.03, dwell=5, remember=_tcp),
         _Phase(lambda s, m: m, _OPEN, remember=lambda s: _tcp(s) + (0.0, 0.0, 0.10)),
     ]
@@ -125,12 +139,16 @@ def _pull_open(cabinet: str, drawer: str) -> list[_Phase]:
     def opened(scene: SceneBatch, memory: np.ndarray) -> np.ndarray:
         return _body(scene, cabinet) + Cabinet.HANDLE + (0.0, -Cabinet.OPEN_BELOW, 0.0)
 
+    def hooked(scene: SceneBatch) -> np.ndarray:
+        x, y, z = (_tcp(scene) - handle(scene, 0.0)).T
+        return (np.abs(x) < 0.04) & (y < 0.0) & (y > -0.065) & (np.abs(z) < 0.025)
+
     # The closed fingers hook the bar from behind.
     hook = -0.032
     return [
         _Phase(lambda s, m: handle(s, 0.07) + (0.0, hook, 0.0), _CLOSE, tolerance=0.02),
         _Phase(lambda s, m: handle(s, 0.0) + (0.0, hook, 0.0), _CLOSE, tolerance=0.008),
-        _Phase(opened, _CLOSE),
+        _Phase(opened, _CLOSE, still=hooked),
     ]
 
 
@@ -141,10 +159,14 @@ def _push_on(stove: str) -> list[_Phase]:
         direction = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1)
         return _body(scene, stove) + Stove.PIVOT + Stove.PEG_RADIUS * direction + (0.0, 0.0, height)
 
+    def behind(scene: SceneBatch) -> np.ndarray:
+        away = _tcp(scene) - along(scene, 0.0, 0.03)
+        return (np.linalg.norm(away[:, :2], axis=-1) < 0.075) & (away[:, 2] < 0.03)
+
     return [
         _Phase(lambda s, m: along(s, -0.65, 0.11), _CLOSE, tolerance=0.025),
         _Phase(lambda s, m: along(s, -0.65, 0.03), _CLOSE, tolerance=0.008),
-        _Phase(lambda s, m: along(s, 0.30, 0.03), _CLOSE),
+        _Phase(lambda s, m: along(s, 0.30, 0.03), _CLOSE, still=behind),
     ]
 
 
