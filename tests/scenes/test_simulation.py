@@ -1,10 +1,10 @@
-"""Batched simulation: exact resets, rows that ignore each other, fields of the current state, images of the current row."""
+"""Batched simulation: exact resets, rows that ignore each other, fields and images of the current state."""
 
 import mujoco
 import numpy as np
 import pytest
 
-from worldenv_trl.scenes import ScriptedExpert, SceneBatch, list_tasks, load_task
+from worldenv_trl.scenes import SceneBatch, ScriptedExpert, list_tasks, load_task
 
 TASKS = list_tasks("goal")
 RNG = np.random.default_rng(0)

@@ -1,0 +1,131 @@
+"""Chunked actions: one decision is exactly its steps, and a stop inside a chunk stops there."""
+
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from worldenv_trl.envs import ExpertPolicy, TabletopEnv, chunked
+from worldenv_trl.keys import (
+    ACTION,
+    CHUNK,
+    FRAMES,
+    IMAGE,
+    KINEMATIC_STATE,
+    KINEMATIC_STATES,
+    NUM_STEPS,
+    SIM_STATE,
+    STATE,
+    STATES,
+    STEP_MASK,
+    SUCCESS,
+)
+
+DRAWER = "goal/open_the_top_drawer"
+C = 4
+
+
+def make(n=2, **options):
+    options = {
+        "image_size": 16,
+        "seed": 0,
+        "num_threads": 1,
+        "with_sim_state": True,
+        "init_state_mode": "cycle",
+    } | options
+    return TabletopEnv(DRAWER, n, **options)
+
+
+def plan(steps, n):
+    return torch.rand(steps, n, 7, generator=torch.Generator().manual_seed(0)) * 2 - 1
+
+
+def expert_plan(n, steps, first=0):
+    """Actions [steps, n, 7] that open the drawer, and how many of them each row needs."""
+    env = make(n, cameras=(), terminate_on_success=False, max_steps=steps, init_state_id=first)
+    rollout = env.rollout(steps, ExpertPolicy(env))
+    return rollout[ACTION].transpose(0, 1), rollout["next", SUCCESS].squeeze(-1).long().argmax(1) + 1
+
+
+@pytest.mark.parametrize("frames", [False, True])
+def test_specs_are_what_is_written(frames):
+    env = chunked(make(3), C, frames=frames)
+    check_env_specs(env)
+    env.close()
+
+
+def test_one_decision_is_its_steps_one_by_one():
+    actions = plan(2 * C, 3)
+    steps, single = make(3), []
+    td = steps.reset()
+    for action in actions:
+        td = steps.step(td.set(ACTION, action))
+        single.append(td["next"].clone())
+        td = steps.step_mdp(td)
+    env = chunked(make(3), C, frames=True)
+    td = env.reset()
+    assert not td[STEP_MASK].any()
+    for decision in range(2):
+        part = slice(decision * C, (decision + 1) * C)
+        td = env.step(td.set(CHUNK, actions[part].transpose(0, 1)))
+        out, last = td["next"], single[decision * C + C - 1]
+        for key in (IMAGE, STATE, KINEMATIC_STATE, NUM_STEPS, SUCCESS, SIM_STATE, "reward", "done"):
+            assert torch.equal(out[key], last[key]), key
+        for whole, one in ((FRAMES, IMAGE), (STATES, STATE), (KINEMATIC_STATES, KINEMATIC_STATE)):
+            assert torch.equal(out[whole], torch.stack([shown[one] for shown in single[part]], 1))
+        assert out[STEP_MASK].all()
+        td = env.step_mdp(td)
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_a_success_inside_a_chunk_ends_there_with_its_reward(n):
+    actions, needed = expert_plan(n, 40)
+    length = int(needed.max()) + 3  # every row ends before the chunk does
+    env = chunked(make(n), length, frames=True)
+    out = env.step(env.reset().set(CHUNK, actions[:length].transpose(0, 1)))["next"]
+    assert torch.equal(out[NUM_STEPS].flatten(), needed) and torch.equal(out[STEP_MASK].sum(1), needed)
+    assert torch.equal(out[STEP_MASK], torch.arange(length) < needed[:, None])
+    assert out["terminated"].all() and out["done"].all() and out[SUCCESS].all()
+    assert torch.equal(out["reward"], torch.ones(n, 1))
+    for row, count in enumerate(needed):
+        assert torch.equal(out[FRAMES][row, count - 1], out[IMAGE][row])
+
+
+def test_a_row_that_ended_waits_for_the_others_in_later_chunks():
+    actions, needed = expert_plan(3, 48)
+    env = chunked(make(3), C)
+    decisions = -(-int(needed.max()) // C)
+    chunks = iter(actions.unflatten(0, (-1, C)).permute(0, 2, 1, 3))
+    rollout = env.rollout(decisions, lambda td: td.set(CHUNK, next(chunks)), break_when_all_done=True)
+    done = rollout["next", "done"].squeeze(-1)
+    valid = (done.cumsum(1) - done.long()) == 0
+    executed = (rollout["next", STEP_MASK] & valid[..., None]).sum((1, 2))
+    assert torch.equal(executed, needed)
+    assert torch.equal((rollout["next", "reward"].squeeze(-1) * valid).sum(1), torch.ones(3))
+
+
+def test_a_limit_that_is_no_multiple_of_the_chunk_truncates_inside_it():
+    env = chunked(make(2, max_steps=6), C)
+    rollout = env.rollout(5, lambda td: td.set(CHUNK, torch.zeros(2, C, 7)), break_when_all_done=True)
+    assert rollout.shape == (2, 2)
+    assert rollout["next", STEP_MASK][:, 1].tolist() == [[True, True, False, False]] * 2
+    assert rollout["next", "truncated"][:, 1].all() and (rollout["next", NUM_STEPS][:, 1] == 6).all()
+
+
+def test_a_partial_reset_clears_the_mask_of_its_rows_only_in_the_observation():
+    env = chunked(make(2), C)
+    td = env.rollout(2, lambda td: td.set(CHUNK, torch.zeros(2, C, 7)), auto_reset=True)[:, -1]["next"]
+    td["_reset"] = torch.tensor([[True], [False]])
+    after = env.reset(td)
+    assert after[NUM_STEPS].flatten().tolist() == [0, 2 * C] and not after[STEP_MASK][0].any()
+
+
+def test_chunks_that_cannot_be_are_refused():
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        chunked(make(1), 0)
+    env = chunked(make(2), C)
+    td = env.reset()
+    for chunk in (torch.zeros(2, C + 1, 7), torch.zeros(2, C, 6), torch.zeros(2, C, 7, dtype=torch.int32)):
+        with pytest.raises(ValueError, match=r"must be floats \[2, 4, 7\]"):
+            env.step(td.clone().set(CHUNK, chunk))
+    with pytest.raises(ValueError, match="NaN"):
+        env.step(td.clone().set(CHUNK, torch.full((2, C, 7), torch.nan)))
