@@ -13,7 +13,7 @@ __all__ = ["reflector_samples"]
 def reflector_samples(episodes: TensorDictBase, *, once_solved: bool = False) -> TensorDict:
     """Videos and per-frame labels of ``episodes`` [R] (:func:`~worldenv_trl.data.episodes_from_rollouts`).
 
-    Returns a TensorDict [R]: ``frames`` uint8 [R, T + 1, 3, H, W] (not a copy), ``label`` float32 [R, T + 1], ``mask``
+    Returns a TensorDict [R]: ``frames`` uint8 [R, T + 1, 3, H, W] (not a copy), ``label`` bool [R, T + 1], ``mask``
     bool [R, T + 1] (False past the end of an episode) and ``task_id`` [R, 1]. The label of frame t says whether the
     prefix o_0..o_t shows the goal reached.
 
@@ -21,7 +21,7 @@ def reflector_samples(episodes: TensorDictBase, *, once_solved: bool = False) ->
         episodes: with ``success``. Imagined frames take the labels of the physics that executed the same actions.
 
     Keyword Args:
-        once_solved: keep the label at 1 after the goal was first reached, even if it is undone later; by default the
+        once_solved: keep the label True after the goal was first reached, even if it is undone later; by default the
             label follows the physics frame by frame.
 
     Raises:
@@ -39,7 +39,7 @@ def reflector_samples(episodes: TensorDictBase, *, once_solved: bool = False) ->
     return TensorDict(
         {
             "frames": episodes["frames"],
-            "label": success.float(),
+            "label": success,
             "mask": place <= episodes["length"],
             TASK_ID: episodes[TASK_ID],
         },
