@@ -35,8 +35,10 @@ class TabletopArena:
             castshadow=False,
             diffuse=(0.35, 0.35, 0.35),
         )
-        root.worldbody.add("geom", name="table", type="box", pos=(0, 0, -0.02), size=(0.5, 0.7, 0.02), rgba=(0.72, 0.70, 0.66, 1),
-                           friction=(1.0, 0.01, 0.0005), condim=4)  # fmt: skip
+        root.worldbody.add(
+            "geom", name="table", type="box", pos=(0, 0, -0.02), size=(0.5, 0.7, 0.02), rgba=(0.72, 0.70, 0.66, 1),
+            friction=(1.0, 0.01, 0.0005), condim=4,
+        )  # fmt: skip
         root.worldbody.add(
             "geom",
             name="wall",

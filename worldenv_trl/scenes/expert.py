@@ -109,7 +109,7 @@ class ScriptedExpert:
 def _put_on(bowl: str, plate: str) -> list[_Phase]:
     def rim(scene: SceneBatch, height: float) -> np.ndarray:
         radius = Bowl.RIM_RADIUS - 0.004
-        return _body(scene, bowl) + (0.0, radius, height)
+        return np.add(_body(scene, bowl), (0.0, radius, height))
 
     def over_plate(scene: SceneBatch, bottom: float) -> np.ndarray:
         held = _tcp(scene) - _body(scene, bowl)
@@ -124,30 +124,34 @@ def _put_on(bowl: str, plate: str) -> list[_Phase]:
         _Phase(lambda s, m: rim(s, 0.11), _OPEN, tolerance=0.025),
         _Phase(lambda s, m: rim(s, grip), _OPEN, tolerance=0.006),
         _Phase(lambda s, m: m, _CLOSE, tolerance=0.03, dwell=6, remember=lambda s: rim(s, grip)),
-        _Phase(lambda s, m: m, _CLOSE, tolerance=0.02, remember=lambda s: _tcp(s) + (0.0, 0.0, 0.07)),
+        _Phase(lambda s, m: m, _CLOSE, tolerance=0.02, remember=lambda s: np.add(_tcp(s), (0.0, 0.0, 0.07))),
         _Phase(lambda s, m: over_plate(s, 0.06), _CLOSE, tolerance=0.010, still=held),
         _Phase(lambda s, m: over_plate(s, Plate.TOP - 0.001), _CLOSE, tolerance=0.005, speed=0.2, still=held),
         _Phase(lambda s, m: m, _OPEN, tolerance=0.03, dwell=5, remember=_tcp),
-        _Phase(lambda s, m: m, _OPEN, remember=lambda s: _tcp(s) + (0.0, 0.0, 0.10)),
+        _Phase(lambda s, m: m, _OPEN, remember=lambda s: np.add(_tcp(s), (0.0, 0.0, 0.10))),
     ]
 
 
 def _pull_open(cabinet: str, drawer: str) -> list[_Phase]:
-    def handle(scene: SceneBatch, height: float) -> np.ndarray:
-        return scene.site_xpos[:, scene.model.site(f"{cabinet}/{drawer}_handle").id] + (0.0, 0.0, height)
+    def handle(scene: SceneBatch, height: float = 0.0, behind: float = 0.0) -> np.ndarray:
+        bar = scene.site_xpos[:, scene.model.site(f"{cabinet}/{drawer}_handle").id]
+        return np.add(bar, (0.0, -behind, height))
 
     def opened(scene: SceneBatch, memory: np.ndarray) -> np.ndarray:
-        return _body(scene, cabinet) + Cabinet.HANDLE + (0.0, -Cabinet.OPEN_BELOW, 0.0)
+        travel = scene.qpos[:, scene.model.jnt_qposadr[scene.model.joint(f"{cabinet}/{drawer}").id]]
+        further = np.zeros((len(travel), 3))
+        further[:, 1] = travel - Cabinet.OPEN_BELOW
+        return handle(scene) + further
 
     def hooked(scene: SceneBatch) -> np.ndarray:
-        x, y, z = (_tcp(scene) - handle(scene, 0.0)).T
+        x, y, z = (_tcp(scene) - handle(scene)).T
         return (np.abs(x) < 0.04) & (y < 0.0) & (y > -0.065) & (np.abs(z) < 0.025)
 
     # The closed fingers hook the bar from behind.
-    hook = -0.032
+    hook = 0.032
     return [
-        _Phase(lambda s, m: handle(s, 0.07) + (0.0, hook, 0.0), _CLOSE, tolerance=0.02),
-        _Phase(lambda s, m: handle(s, 0.0) + (0.0, hook, 0.0), _CLOSE, tolerance=0.008),
+        _Phase(lambda s, m: handle(s, 0.07, hook), _CLOSE, tolerance=0.02),
+        _Phase(lambda s, m: handle(s, 0.0, hook), _CLOSE, tolerance=0.008),
         _Phase(opened, _CLOSE, still=hooked),
     ]
 
@@ -159,14 +163,10 @@ def _push_on(stove: str) -> list[_Phase]:
         direction = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1)
         return _body(scene, stove) + Stove.PIVOT + Stove.PEG_RADIUS * direction + (0.0, 0.0, height)
 
-    def behind(scene: SceneBatch) -> np.ndarray:
-        away = _tcp(scene) - along(scene, 0.0, 0.03)
-        return (np.linalg.norm(away[:, :2], axis=-1) < 0.075) & (away[:, 2] < 0.03)
-
     return [
         _Phase(lambda s, m: along(s, -0.65, 0.11), _CLOSE, tolerance=0.025),
         _Phase(lambda s, m: along(s, -0.65, 0.03), _CLOSE, tolerance=0.008),
-        _Phase(lambda s, m: along(s, 0.30, 0.03), _CLOSE, still=behind),
+        _Phase(lambda s, m: along(s, 0.30, 0.03), _CLOSE),
     ]
 
 

@@ -77,7 +77,6 @@ class Cabinet(_Primitive):
     """
 
     OPEN_BELOW = -0.14
-    HANDLE = (0.0, 0.165, 0.147)  # middle of the top handle's bar when closed
     DEPTH, WIDTH, LEVELS = 0.10, 0.085, (("bottom", 0.03), ("middle", 0.085), ("top", 0.14))
 
     def _shape(self, body: mjcf.Element) -> None:
@@ -133,7 +132,10 @@ class Cabinet(_Primitive):
 
 
 class Stove(_Primitive):
-    """A flat stove with one burner and a lever; joint ``lever`` turns from 0 (off) to 1.7 rad. The burner glows when on."""
+    """A flat stove with one burner and a lever; joint ``lever`` turns from 0 (off) to 1.7 rad.
+
+    The burner glows when on: see ``Task.paint``.
+    """
 
     ON_ABOVE = 1.0
     PEG_RADIUS = 0.085  # lever axis to the peg that is pushed
@@ -144,8 +146,8 @@ class Stove(_Primitive):
     def _shape(self, body: mjcf.Element) -> None:
         body.add("geom", type="box", pos=(0, 0, 0.0125), size=(0.14, 0.12, 0.0125), rgba=(0.78, 0.80, 0.83, 1))
         body.add(
-            "geom", name="burner", type="cylinder", pos=(0.075, 0, 0.0275), size=(0.055, 0.003), rgba=(0.18, 0.18, 0.2, 1),
-            contype=0, conaffinity=0,
+            "geom", name="burner", type="cylinder", pos=(0.075, 0, 0.0275), size=(0.055, 0.003),
+            rgba=(0.18, 0.18, 0.2, 1), contype=0, conaffinity=0,
         )  # fmt: skip
         lever = body.add("body", name="lever", pos=self.PIVOT, euler=(0, 0, self.START_ANGLE), gravcomp=1)
         lever.add(
@@ -163,8 +165,8 @@ class Stove(_Primitive):
             **black,
         )
         lever.add(
-            "geom", name="peg", type="cylinder", pos=(self.PEG_RADIUS, 0, self.PEG_HEIGHT / 2), size=(0.013, self.PEG_HEIGHT / 2),
-            mass=0.05, rgba=(0.95, 0.80, 0.1, 1),
+            "geom", name="peg", type="cylinder", pos=(self.PEG_RADIUS, 0, self.PEG_HEIGHT / 2),
+            size=(0.013, self.PEG_HEIGHT / 2), mass=0.05, rgba=(0.95, 0.80, 0.1, 1),
         )  # fmt: skip
         lever.add("site", name="peg", pos=(self.PEG_RADIUS, 0, self.PEG_HEIGHT / 2), size=(0.003,), rgba=(0, 0, 0, 0))
 

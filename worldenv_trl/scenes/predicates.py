@@ -1,7 +1,7 @@
 """Goal predicates with LIBERO's meaning, for all rows of a :class:`SceneBatch` at once.
 
-``On(a, b)``: a rests on b and their centres are within 3 cm. LIBERO asks MuJoCo for a contact; here the resting contact is
-read from the poses (a upright, its bottom at b's top), which the batch has for every row at no cost.
+``On(a, b)``: a rests on b and their centres are within 3 cm. LIBERO asks MuJoCo for a contact; here the resting contact
+is read from the poses (a upright, its bottom at b's top), which the batch has for every row at no cost.
 """
 
 from __future__ import annotations
