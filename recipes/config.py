@@ -24,14 +24,14 @@ class Demonstrate:
 class SFT:
     """Supervised fine-tuning: L1 on the action chunk, then the Laplace scale head alone (World-Env Eq. 8)."""
 
-    steps: int = 2000
+    steps: int = 1500
     batch_size: int = 64
     lr: float = 1e-3
     weight_decay: float = 1e-4
     shift_px: int = 2
     """Random image shift, the augmentation that helps with five demonstrations."""
     dim: int = 128
-    depth: int = 3
+    depth: int = 2
     scale_steps: int = 200
     scale_lr: float = 1e-3
 
@@ -58,6 +58,8 @@ class WorldModel:
     weight_decay: float = 1e-3
     unroll_prob: float = 0.5
     """Share of updates in which the second chunk is generated from the model's own first chunk."""
+    frames_per_chunk: int | None = 4
+    """Frames of each chunk that are painted and scored in an update; all if None."""
     denoise_steps: int = 1
     deterministic: bool = True
     """One step from zero noise; set to False to sample with ``denoise_steps`` steps."""

@@ -5,13 +5,14 @@ Alone: ``python recipes/demonstrate.py improve --run-dir runs/improve``.
 
 from __future__ import annotations
 
-from config import WorldEnvConfig
-from parts import expert_policy, seed_everything, step_env
-from run_folder import RunFolder
 from tqdm import tqdm
 
+from config import WorldEnvConfig
+from parts import seed_everything, tabletop
+from run_folder import RunFolder
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
+from worldenv_trl.envs import ExpertPolicy
 from worldenv_trl.record import RolloutWriter
 
 
@@ -22,10 +23,10 @@ def run(config: WorldEnvConfig, folder: RunFolder) -> None:
     metadata = {"stage": "demonstrate", "tasks": list(config.tasks), "seed": config.seed}
     with RolloutWriter(folder.rollouts("demonstrations"), metadata=metadata, overwrite=True) as writer:
         for task in tqdm(config.tasks, desc="demonstrate", unit="task"):
-            env = step_env(config, "train", count, tasks=[task], init_state_mode="cycle", terminate_on_success=True)
+            env = tabletop(config, "train", count, [task], init_state_mode="cycle", terminate_on_success=True)
             collector = GroupCollector(
                 env,
-                expert_policy(env),
+                ExpertPolicy(env),
                 groups_per_batch=count,
                 group_size=1,
                 total_groups=count,

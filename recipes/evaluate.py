@@ -8,10 +8,11 @@ Alone: ``python recipes/evaluate.py improve --run-dir runs/improve``.
 from __future__ import annotations
 
 import torch
-from config import WorldEnvConfig
-from parts import load_policy, load_reflector, physics_outcomes, seed_everything
-from run_folder import RunFolder
 
+from config import WorldEnvConfig
+from outcomes import physics_outcomes
+from parts import load_policy, load_reflector, seed_everything
+from run_folder import RunFolder
 from worldenv_trl.metrics import paired_test, wilson_interval
 from worldenv_trl.policies import laplace_actor
 from worldenv_trl.record import RolloutWriter

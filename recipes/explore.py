@@ -5,11 +5,11 @@ Alone: ``python recipes/explore.py improve --run-dir runs/improve``.
 
 from __future__ import annotations
 
+from tqdm import tqdm
+
 from config import WorldEnvConfig
 from parts import chunk_player, load_policy, seed_everything, step_env
 from run_folder import RunFolder
-from tqdm import tqdm
-
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.policies import laplace_actor

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from config import WorldEnvConfig
-from run_folder import RunFolder
 from tensordict import TensorDict
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker, TransformedEnv
 from torchrl.modules import MultiStepActorWrapper
 
+from config import WorldEnvConfig
+from run_folder import RunFolder
 from worldenv_trl import keys
 from worldenv_trl.data import concatenate_episodes, episodes_from_rollouts
 from worldenv_trl.envs import ImaginedEnv, Reflect, TabletopEnv, chunked
@@ -35,7 +35,7 @@ def check_config(config: WorldEnvConfig) -> None:
         raise ValueError(f"max_steps must be a multiple of chunk_length={config.chunk_length}, got {config.max_steps}")
     for task in config.tasks:
         load_task(task)
-    step_env(config, "train", 1, tasks=config.tasks[:1]).close()
+    tabletop(config, "train", 1, config.tasks[:1]).close()
 
 
 def seed_everything(config: WorldEnvConfig, offset: int) -> None:
@@ -51,18 +51,18 @@ def step_env(
     config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[str] | None = None, **options
 ) -> TransformedEnv:
     """Physics, one action a step (every frame is seen), with the ``is_init`` that :func:`chunk_player` needs."""
-    return TransformedEnv(_tabletop(config, split, num_envs, tasks, **options), InitTracker())
+    return TransformedEnv(tabletop(config, split, num_envs, tasks, **options), InitTracker())
 
 
 def physics_waves_env(config: WorldEnvConfig, groups: int, group_size: int) -> EnvBase:
     """Physics, one chunk a step, rows in groups that share an initial state: LOOP's upper bound."""
     return chunked(
-        _tabletop(config, "train", groups * group_size, None, init_state_mode="random", group_repeats=group_size),
+        tabletop(config, "train", groups * group_size, None, init_state_mode="random", group_repeats=group_size),
         config.chunk_length,
     )
 
 
-def _tabletop(config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[str] | None, **options) -> TabletopEnv:
+def tabletop(config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[str] | None, **options) -> TabletopEnv:
     tasks = list(config.tasks if tasks is None else tasks)
     options = {"seed": config.seed, "num_threads": config.num_threads, "proprio": PROPRIO} | options
     return TabletopEnv(
@@ -93,10 +93,10 @@ def imagined_env(
         proprio=PROPRIO,
         seed=config.seed,
     )
-    return TransformedEnv(env, reflect(reflector))
+    return TransformedEnv(env, stopping_rule(reflector))
 
 
-def reflect(reflector: CompactReflector) -> Reflect:
+def stopping_rule(reflector: CompactReflector) -> Reflect:
     """The stopping rule that was chosen when the reflector was trained is stored with it."""
     return Reflect(reflector, threshold=reflector.config.threshold, consecutive=reflector.config.consecutive)
 
@@ -139,3 +139,12 @@ def read_contexts(folder: RunFolder) -> TensorDict:
     return first[rows].select(
         keys.IMAGE, keys.STATE, keys.KINEMATIC_STATE, keys.INSTRUCTION, keys.TASK_ID, keys.CONTEXT_ID
     )
+
+
+def split_by_context(episodes: TensorDict, share: float, seed: int) -> tuple[TensorDict, TensorDict]:
+    """Episodes for training, and those of a ``share`` of the initial states (at least one) for figures."""
+    contexts = episodes[keys.CONTEXT_ID].squeeze(-1)
+    distinct = contexts.unique()
+    order = torch.randperm(len(distinct), generator=torch.Generator().manual_seed(seed))
+    kept_out = torch.isin(contexts, distinct[order[: max(1, round(share * len(distinct)))]])
+    return episodes[~kept_out], episodes[kept_out]

@@ -7,9 +7,11 @@ Alone: ``python recipes/post_train.py improve --run-dir runs/improve``.
 from __future__ import annotations
 
 import torch
+from tqdm import tqdm
+
 from config import WorldEnvConfig
+from outcomes import greedy_outcomes
 from parts import (
-    greedy_outcomes,
     imagined_env,
     load_policy,
     load_reflector,
@@ -19,8 +21,6 @@ from parts import (
     seed_everything,
 )
 from run_folder import RunFolder
-from tqdm import tqdm
-
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.metrics import honesty
@@ -34,7 +34,7 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
     settings = config.post_train
     seed_everything(config, offset=50)
     policy = load_policy(folder, source, "sft")
-    if not policy.has_lora:
+    if not policy.config.lora_rank:
         policy.add_lora(settings.lora_rank)
     actor = laplace_actor(policy, scale_factor=settings.scale_factor)
 
@@ -54,7 +54,7 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
     )
     loss = LOOPLoss(actor, clip_epsilon=settings.clip_epsilon, ratio_level=settings.ratio_level, functional=False)
     heads = list(policy.head_parameters())
-    lora = [p for n, p in policy.named_parameters() if "lora_" in n and p.requires_grad]
+    lora = list(policy.lora_parameters())
     optimizer = torch.optim.AdamW(
         [{"params": lora, "lr": settings.lora_lr}, {"params": heads, "lr": settings.head_lr}], weight_decay=0.0
     )
@@ -65,7 +65,7 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
         warmup = min(1.0, (iteration + 1) / (settings.warmup_iterations + 1))
         for group, rate in zip(optimizer.param_groups, final_rates, strict=True):
             group["lr"] = warmup * rate
-        returns = wave["returns"]  # [G, N]
+        returns = wave["returns"][..., 0]  # [G, N]
         advantage = rloo_advantage(returns)
         if settings.standardize:
             advantage = advantage / advantage.std().clamp_min(1e-6)

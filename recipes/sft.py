@@ -8,15 +8,15 @@ from __future__ import annotations
 import math
 
 import torch
-from config import WorldEnvConfig
-from parts import seed_everything, task_instructions
-from run_folder import RunFolder
 from torchrl.objectives import BCLoss
 from tqdm import trange
 
+from config import WorldEnvConfig
+from parts import seed_everything, task_instructions
+from run_folder import RunFolder
 from worldenv_trl import keys
 from worldenv_trl.data import episodes_from_rollouts, policy_samples
-from worldenv_trl.policies import OFTConfig, OFTPolicy, laplace_actor, random_shift
+from worldenv_trl.policies import OFTConfig, OFTPolicy, laplace_actor, likelihood_actor, random_shift
 from worldenv_trl.record import read_rollouts
 
 
@@ -27,19 +27,17 @@ def run(config: WorldEnvConfig, folder: RunFolder) -> None:
     episodes = episodes_from_rollouts(read_rollouts(folder.require_rollouts("demonstrations", "demonstrate")))
     samples = policy_samples(episodes, config.chunk_length)
     policy = OFTPolicy(
-        OFTConfig(
+        OFTConfig.for_tasks(
+            task_instructions(config),
             image_size=config.image_size,
             chunk_length=config.chunk_length,
             dim=settings.dim,
             depth=settings.depth,
-            instructions=task_instructions(config),
         )
     )
     policy.fit_statistics(samples[keys.STATE], samples[keys.CHUNK])
-    actor = laplace_actor(policy, event_dims=1)
-
     heads_and_backbone = [*policy.backbone_parameters(), *policy.loc_head_parameters()]
-    loss = _behaviour_cloning(actor, "l1")
+    loss = _behaviour_cloning(laplace_actor(policy), loss_function="l1")
     _train(loss, samples, heads_and_backbone, settings.steps, settings.lr, settings, folder, "l1")
 
     # Only the scale head moves from here on (World-Env section 4.1).
@@ -47,14 +45,14 @@ def run(config: WorldEnvConfig, folder: RunFolder) -> None:
     scale_head = list(policy.scale_head_parameters())
     for parameter in scale_head:
         parameter.requires_grad_(True)
-    loss = _behaviour_cloning(actor, None)
+    loss = _behaviour_cloning(likelihood_actor(policy))
     _train(loss, samples, scale_head, settings.scale_steps, settings.scale_lr, settings, folder, "nll")
     policy.requires_grad_(True)
     policy.save_pretrained(folder.checkpoint("sft"))
 
 
-def _behaviour_cloning(actor, loss_function: str | None) -> BCLoss:
-    loss = BCLoss(actor) if loss_function is None else BCLoss(actor, loss_function=loss_function)
+def _behaviour_cloning(actor, **options) -> BCLoss:
+    loss = BCLoss(actor, **options)
     loss.set_keys(action=keys.CHUNK, pad_mask=keys.ACTION_IS_PAD)
     return loss
 

@@ -1,27 +1,191 @@
-"""The instant reflector: real rollouts plus imagined replays of the same actions, labelled by the physics.
+"""The instant reflector: an encoder, then frozen, and a reward head on real and imagined prefixes.
 
+Imagined prefixes are replays of recorded actions in the world model, labelled by what the physics did under them.
 Alone: ``python recipes/train_reflector.py improve --run-dir runs/improve``.
 """
 
 from __future__ import annotations
 
+import dataclasses
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict
+from tqdm import trange
+
 from config import WorldEnvConfig
-from parts import (
-    build_reflector,
-    holdout_split,
-    imagine_episodes,
-    load_world_model,
-    read_episodes,
-    seed_everything,
-    train_reward_head,
-)
+from parts import load_world_model, read_episodes, seed_everything, split_by_context
 from run_folder import RunFolder
-
+from worldenv_trl import keys
 from worldenv_trl.data import concatenate_episodes
+from worldenv_trl.data.imagine import imagine_episodes
+from worldenv_trl.kinematics import ForwardKinematics
+from worldenv_trl.metrics import classification
+from worldenv_trl.objectives import ReflectorLoss
+from worldenv_trl.reflectors import CompactReflector, CompactReflectorConfig, blurred
+from worldenv_trl.scenes import load_task
 
 
-def run(config: WorldEnvConfig, folder: RunFolder, target: str = "reflector", models: str = "", round: int = 1) -> None:
-    """Reads the rollouts of rounds up to ``round``; writes ``checkpoints/<target>`` and its held-out figures."""
+def run(
+    config: WorldEnvConfig, folder: RunFolder, target: str = "reflector", models: str = "", rounds: int = 1
+) -> None:
+    """Reads the rollouts of the first ``rounds`` rounds; writes ``checkpoints/<target>`` and its held-out figures."""
+    settings = config.reflector
+    seed_everything(config, offset=40 + rounds)
+    demonstrations, explored = read_episodes(folder, rounds)
+    training, held_out = split_by_context(explored, config.world_model.holdout, config.seed)
+    world_model, kinematics = load_world_model(folder, models), ForwardKinematics()
+    share = min(1.0, settings.imagined_share / max(1e-6, 1 - settings.imagined_share))
+    chosen = torch.randperm(len(training))[: round(share * len(training))]
+    imagined = [imagine_episodes(world_model, training[chosen], kinematics, seed=config.seed)] if len(chosen) else []
+    episodes = concatenate_episodes([demonstrations, training, *imagined])
+    imagined_held_out = imagine_episodes(world_model, held_out, kinematics, seed=config.seed + 1)
+
+    tasks = max(load_task(task).task_id for task in config.tasks) + 1
+    reflector = CompactReflector(CompactReflectorConfig(num_tasks=tasks, image_size=config.image_size))
+    _train_encoder(reflector, episodes, settings, folder, target)
+    reflector.encoder.requires_grad_(False)
+    _train_head(reflector, episodes, settings, folder, target)
+    reflector.eval()
+
+    rule = (settings.threshold, settings.consecutive)
+    scores = {"real": all_scores(reflector, held_out), "imagined": all_scores(reflector, imagined_held_out)}
+    if settings.choose_threshold:  # on training contexts that no part of the reflector has seen
+        rule = choose_rule(scores["imagined"], held_out)
+    reflector.config = dataclasses.replace(reflector.config, threshold=rule[0], consecutive=rule[1])
+    reflector.save_pretrained(folder.checkpoint(target))
+    for name, values in scores.items():
+        frames = frame_figures(values, held_out, rule[0])
+        folder.log(
+            target,
+            rollouts=name,
+            threshold=rule[0],
+            consecutive=rule[1],
+            **frames,
+            **episode_figures(values, held_out, rule),
+        )
+
+
+def _draw_frames(episodes: TensorDict, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Episode and frame of ``count`` frames, successes as likely as failures where there are any."""
+    success = episodes["success"] & (torch.arange(episodes["success"].shape[1]) <= episodes["length"])
+    failure = ~episodes["success"] & (torch.arange(episodes["success"].shape[1]) <= episodes["length"])
+    pools = [pool.nonzero() for pool in (success, failure) if pool.any()]
+    drawn = [pool[torch.randint(len(pool), (count // len(pools),))] for pool in pools]
+    return torch.cat(drawn).unbind(-1)
+
+
+def _train_encoder(reflector: CompactReflector, episodes: TensorDict, settings, folder: RunFolder, target: str) -> None:
+    parameters = reflector.encoder_parameters()
+    optimizer = torch.optim.AdamW(parameters, lr=settings.lr, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, settings.lr, total_steps=settings.encoder_steps)
+    for step in trange(settings.encoder_steps, desc=f"{target} encoder", unit="step"):
+        row, frame = _draw_frames(episodes, 2 * settings.batch_size)
+        both = torch.cat([episodes["frames"][row, frame], episodes["frames"][row, 0]], 1)
+        both = _shifted_together(both)
+        now, first = (blurred(images, float(torch.rand(()))) for images in both.split(3, 1))
+        noise = 6 * torch.randn_like(now)
+        logits = reflector.frame_logits(now + noise, first, episodes[keys.TASK_ID][row])
+        value = F.binary_cross_entropy_with_logits(logits, episodes["success"][row, frame].float())
+        optimizer.zero_grad()
+        value.backward()
+        optimizer.step()
+        schedule.step()
+        if step % 50 == 0:
+            folder.log(target, step=step, encoder_loss=value.item())
+
+
+def _shifted_together(both: torch.Tensor) -> torch.Tensor:
+    """Moves frames and their first frames ``[n, 6, H, W]`` alike, by up to two pixels."""
+    dx, dy = torch.randint(5, (2,)).tolist()
+    height, width = both.shape[-2:]
+    return F.pad(both.float(), (2, 2, 2, 2), mode="replicate")[..., dy : dy + height, dx : dx + width]
+
+
+def _train_head(reflector: CompactReflector, episodes: TensorDict, settings, folder: RunFolder, target: str) -> None:
+    features = encode_all(reflector, episodes)
+    loss = ReflectorLoss(reflector, label_smoothing=0.02)
+    optimizer = torch.optim.AdamW(reflector.head_parameters(), lr=settings.lr, weight_decay=1e-2)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, settings.lr, total_steps=settings.steps)
+    for step in trange(settings.steps, desc=f"{target} head", unit="step"):
+        row, frame = _draw_frames(episodes, 2 * settings.batch_size)
+        sampled, used = reflector.sample_prefixes(features, row, frame + 1)
+        batch = TensorDict(
+            {
+                "features": sampled + 0.1 * torch.randn_like(sampled),
+                "lengths": used.unsqueeze(-1),
+                keys.TASK_ID: episodes[keys.TASK_ID][row],
+                "label": episodes["success"][row, frame].unsqueeze(-1),
+            },
+            batch_size=[len(row)],
+        )
+        out = loss(batch)
+        optimizer.zero_grad()
+        out["loss_reflector"].backward()
+        optimizer.step()
+        schedule.step()
+        if step % 50 == 0:
+            folder.log(target, step=step, loss=out["loss_reflector"].item(), accuracy=out["accuracy"].item())
+
+
+def encode_all(reflector: CompactReflector, episodes: TensorDict) -> torch.Tensor:
+    """Features ``[R, T+1, F]`` of all frames."""
+    parts = [
+        reflector.encode(frames.flatten(0, 1)).unflatten(0, frames.shape[:2]) for frames in episodes["frames"].split(16)
+    ]
+    return torch.cat(parts)
+
+
+@torch.no_grad()
+def all_scores(reflector: CompactReflector, episodes: TensorDict) -> torch.Tensor:
+    """R(o_1:t, g) of every frame ``[R, T+1]``."""
+    features = encode_all(reflector, episodes)
+    parts = []
+    for rows in torch.arange(len(episodes)).split(16):
+        first = torch.zeros(len(rows), dtype=torch.int64)
+        parts.append(reflector.prefix_scores(features[rows], first, features.shape[1], episodes[keys.TASK_ID][rows]))
+    return torch.cat(parts)
+
+
+def _alive(episodes: TensorDict) -> torch.Tensor:
+    return torch.arange(episodes["success"].shape[1]) <= episodes["length"]
+
+
+def frame_figures(scores: torch.Tensor, episodes: TensorDict, threshold: float) -> dict[str, float]:
+    alive = _alive(episodes)
+    figures = classification(scores[alive], episodes["success"][alive], threshold)
+    return {f"frame_{name}": value for name, value in dataclasses.asdict(figures).items()}
+
+
+def stops(scores: torch.Tensor, episodes: TensorDict, rule: tuple[float, int]) -> torch.Tensor:
+    """Frame at which the rule stops each episode ``[R]``, -1 if never."""
+    threshold, consecutive = rule
+    above = ((scores > threshold) & _alive(episodes))[:, 1:]
+    runs = above.unfold(1, consecutive, 1).all(-1)
+    return torch.where(runs.any(1), runs.long().argmax(1) + consecutive, -1)
+
+
+def episode_figures(scores: torch.Tensor, episodes: TensorDict, rule: tuple[float, int]) -> dict[str, float]:
+    """Precision and recall of stopping: a stop is right if the goal has been reached by then (within two frames)."""
+    stop = stops(scores, episodes, rule)
+    reached = episodes["success"].any(1)
+    first = torch.where(reached, episodes["success"].long().argmax(1), 10_000)
+    right = (stop >= 0) & (first <= stop + 2)
+    return {
+        "stop_precision": right.sum().item() / max(int((stop >= 0).sum()), 1),
+        "stop_recall": right.sum().item() / max(int(reached.sum()), 1),
+    }
+
+
+def choose_rule(scores: torch.Tensor, episodes: TensorDict) -> tuple[float, int]:
+    """Threshold and consecutive frames with the best F1 of stopping."""
+
+    def f1(rule: tuple[float, int]) -> float:
+        figures = episode_figures(scores, episodes, rule)
+        precision, recall = figures["stop_precision"], figures["stop_recall"]
+        return 2 * precision * recall / max(precision + recall, 1e-9)
+
+    return max(((threshold, run) for threshold in (0.5, 0.6, 0.7, 0.8, 0.9) for run in (1, 2, 3)), key=f1)
 
 
 if __name__ == "__main__":

@@ -16,19 +16,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import torch
+import tyro
+
 import demonstrate
 import evaluate
 import explore
 import post_train
 import sft
-import torch
 import train_reflector
 import train_world_model
-import tyro
 from config import PRESETS, WorldEnvConfig
 from parts import check_config
 from run_folder import RunFolder
-
 from worldenv_trl.report import plot_run, summary_table
 
 
@@ -55,13 +55,13 @@ def stages(config: WorldEnvConfig) -> list[Stage]:
                     train_world_model.run,
                     target=f"world_model{suffix}",
                     previous=previous and f"world_model{previous}",
-                    round=number,
+                    rounds=number,
                 ),
             ),
             Stage(
                 f"reflector{suffix}",
                 "train_reflector",
-                partial(train_reflector.run, target=f"reflector{suffix}", models=suffix, round=number),
+                partial(train_reflector.run, target=f"reflector{suffix}", models=suffix, rounds=number),
             ),
             Stage(improved, "post_train", partial(post_train.run, source=policy, target=improved, models=suffix)),
         ]

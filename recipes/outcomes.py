@@ -1,0 +1,122 @@
+"""Greedy success of a policy, in the physics and in imagination."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+from torchrl.envs.transforms import TransformedEnv
+from torchrl.envs.utils import ExplorationType
+from tqdm import tqdm
+
+from config import WorldEnvConfig
+from parts import imagined_env, stopping_rule, tabletop
+from worldenv_trl import keys
+from worldenv_trl.collectors import GroupCollector
+from worldenv_trl.record import RolloutWriter
+from worldenv_trl.reflectors import CompactReflector
+from worldenv_trl.world_models import VideoWorldModel
+
+
+def physics_outcomes(
+    config: WorldEnvConfig,
+    actor,
+    task: str,
+    split: str,
+    episodes: int,
+    *,
+    num_envs: int | None = None,
+    reflector: CompactReflector | None = None,
+    writer: RolloutWriter | None = None,
+    label: str = "",
+) -> torch.Tensor:
+    """Success bool ``[episodes]`` of the first initial states of a split, in order.
+
+    The goal predicate ends an episode, or, with a ``reflector``, the reflector alone does: then success is whether the goal
+    holds in the moment it stops (or at the step limit).
+    """
+    num_envs = min(num_envs or config.evaluate.num_envs, episodes)
+    env = tabletop(
+        config,
+        split,
+        num_envs,
+        [task],
+        init_state_mode="cycle",
+        init_state_count=episodes,
+        terminate_on_success=reflector is None,
+    )
+    if reflector is not None:
+        env = TransformedEnv(env, stopping_rule(reflector))
+    waves = -(-episodes // num_envs)
+    collector = GroupCollector(
+        chunked_env(env, config),
+        actor,
+        groups_per_batch=num_envs,
+        group_size=1,
+        total_groups=waves * num_envs,
+        exploration_type=ExplorationType.DETERMINISTIC,
+    )
+    outcome: dict[int, bool] = {}
+    for wave in tqdm(collector, total=waves, desc=f"{label} {task}", unit="wave", leave=False, disable=not label):
+        rollouts = wave[:, 0]
+        last = rollouts[keys.MASK].sum(-1) - 1
+        success = rollouts["next", keys.SUCCESS].squeeze(-1)[torch.arange(num_envs), last]
+        context = rollouts[keys.CONTEXT_ID][:, 0, 0]
+        for number, reached in zip(context.tolist(), success.tolist(), strict=True):
+            outcome.setdefault(number, reached)
+        if writer is not None:
+            writer.write(rollouts)
+    collector.shutdown()
+    return torch.tensor([outcome[number] for number in sorted(outcome)][:episodes])
+
+
+def chunked_env(env, config: WorldEnvConfig):
+    from worldenv_trl.envs import chunked
+
+    return chunked(env, config.chunk_length)
+
+
+def imagined_outcomes(
+    config: WorldEnvConfig, actor, world_model: VideoWorldModel, reflector: CompactReflector, contexts: TensorDict
+) -> torch.Tensor:
+    """Whether the reflector stops the greedy policy in imagination, bool ``[K]``, for each context in order."""
+    env = imagined_env(config, world_model, reflector, contexts, [len(contexts), 1])
+    collector = GroupCollector(
+        env,
+        actor,
+        groups_per_batch=len(contexts),
+        total_groups=len(contexts),
+        exploration_type=ExplorationType.DETERMINISTIC,
+    )
+    wave = next(iter(collector))[:, 0]
+    collector.shutdown()
+    stopped = (wave["next", "terminated"].squeeze(-1) & wave[keys.MASK]).any(-1)
+    order = dict(zip(wave[keys.CONTEXT_ID][:, 0, 0].tolist(), stopped.tolist(), strict=True))
+    return torch.tensor([order[number] for number in contexts[keys.CONTEXT_ID].squeeze(-1).tolist()])
+
+
+def greedy_outcomes(
+    config: WorldEnvConfig,
+    actor,
+    world_model: VideoWorldModel,
+    reflector: CompactReflector,
+    contexts: TensorDict,
+    per_task: int,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Greedy success of the first ``per_task`` training contexts of every task: ``(real, imagined)``, bool ``[K]``."""
+    chosen, real = [], []
+    for task in config.tasks:
+        outcome = physics_outcomes(config, actor, task, "train", per_task, num_envs=per_task)
+        real.append(outcome)
+    numbers = contexts[keys.CONTEXT_ID].squeeze(-1)
+    from worldenv_trl.envs import context_id
+    from worldenv_trl.scenes import load_task
+
+    keep = []
+    for place, task in enumerate(config.tasks):
+        for index in range(per_task):
+            found = (numbers == context_id(load_task(task).task_id, "train", index)).nonzero()
+            if len(found):
+                chosen.append(int(found[0, 0]))
+                keep.append(place * per_task + index)
+    imagined = imagined_outcomes(config, actor, world_model, reflector, contexts[chosen])
+    return torch.cat(real)[keep], imagined
