@@ -51,7 +51,7 @@ def episodes_from_rollouts(rollouts: TensorDictBase) -> TensorDict:
     Raises:
         ValueError: naming the entries that are missing, or rollouts in which nothing was executed.
     """
-    if rollouts.ndim < 1 or rollouts.numel() == 0:
+    if rollouts.ndim < 1 or 0 in rollouts.shape:
         raise ValueError(f"rollouts must be [*B, T] with at least one step, got {list(rollouts.shape)}")
     rollouts = rollouts.reshape(-1, rollouts.shape[-1]) if rollouts.ndim != 2 else rollouts
     present = set(rollouts.keys(True, True))

@@ -173,7 +173,7 @@ def from_bytes(raw: np.ndarray, entry: Entry) -> Tensor:
     """[n, nbytes] -> [n, *shape]."""
     if entry.nbytes == 0:
         return torch.zeros(len(raw), *entry.shape, dtype=entry.torch_dtype)
-    values = torch.from_numpy(np.ascontiguousarray(raw)).view(entry.torch_dtype)
+    values = torch.from_numpy(raw.copy()).view(entry.torch_dtype)
     return values.reshape(len(raw), *entry.shape)
 
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimitExceeded
+from mcap.exceptions import InvalidMagic, McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Schema
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 __all__ = ["Truncated", "scan"]
@@ -31,27 +31,37 @@ def scan(path: Path) -> Iterator[McapRecord]:
     """
     size = path.stat().st_size
     with open(path, "rb") as file:
-        reader = StreamReader(file, emit_chunks=True, record_size_limit=max(size, 1))
-        records = reader.records
-        start = 8  # where the next record begins, behind the magic
+        records = StreamReader(file, emit_chunks=True, record_size_limit=max(size, 1)).records
+        start = 8  # where the record that is being read begins, behind the magic
         try:
             while (record := next(records, None)) is not None:
-                start = file.tell() if not isinstance(record, Footer) else start
                 if isinstance(record, Chunk):
                     yield from breakup_chunk(record, validate_crc=True)
                 else:
                     yield record
+                start = file.tell()
             return
         except InvalidMagic as error:
-            if start == 8:
-                raise ValueError(f"{path} is not an MCAP file") from error
-        except (EndOfFile, RecordLengthLimitExceeded) as error:
+            if start > 8:
+                raise ValueError(f"{path} is damaged at its end. Restore it from a copy") from error
+            raise ValueError(f"{path} is not an MCAP file") from error
+        except (CRCValidationError, McapError, zstandard.ZstdError, struct.error, UnicodeDecodeError) as error:
             if size < 8:
                 raise ValueError(f"{path} is not an MCAP file: it has {size} bytes") from error
-        except (CRCValidationError, McapError, zstandard.ZstdError, struct.error, UnicodeDecodeError) as error:
-            raise ValueError(f"{path} is damaged around byte {start}: {error}. Restore it from a copy") from error
+            if not _reaches_past(file, start, size):
+                raise ValueError(f"{path} is damaged behind byte {start}: {error}. Restore it from a copy") from error
         yield from _unfinished_chunk(file, start)
     raise Truncated(str(path))
+
+
+def _reaches_past(file: io.BufferedReader, start: int, size: int) -> bool:
+    """Whether the record at ``start`` ends behind the file, as the last one of an interrupted recording does."""
+    file.seek(start)
+    head = file.read(9)
+    if len(head) < 9:
+        return True
+    opcode, length = struct.unpack("<BQ", head)
+    return start + 9 + length + (8 if opcode == Opcode.FOOTER else 0) > size
 
 
 def _unfinished_chunk(file: io.BufferedReader, start: int) -> Iterator[McapRecord]:

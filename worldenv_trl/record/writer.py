@@ -111,7 +111,7 @@ class RolloutWriter:
         """
         if self._closed:
             raise ValueError(f"the writer of {self.path} is closed")
-        if rollouts.ndim < 1 or rollouts.numel() == 0:
+        if rollouts.ndim < 1 or 0 in rollouts.shape:
             raise ValueError(f"rollouts must be [*B, T] with at least one entry, got {list(rollouts.shape)}")
         tensors, texts = leaves(rollouts)
         valid = executed_entries(rollouts)

@@ -1,0 +1,296 @@
+from __future__ import annotations
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+import torch
+from mcap.reader import make_reader
+from tensordict import NonTensorData, NonTensorStack, TensorDict
+
+from worldenv_trl import keys
+from worldenv_trl.record import RolloutWriter, read_attachments, read_metadata, read_rollouts
+
+SIZE = 16
+
+
+def step_rollouts(lengths: list[int], steps: int = 6, seed: int = 0, task: int = 0) -> TensorDict:
+    """Rollouts [R, T] as an env writes them: a finished row stays as it was."""
+    generator = torch.Generator().manual_seed(seed)
+    rows = len(lengths)
+    done = torch.arange(1, steps + 1) >= torch.tensor(lengths).unsqueeze(-1)
+
+    def chain(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        values = torch.randn(rows, steps + 1, *shape, generator=generator) * 100
+        values = values.abs().clamp(max=255).to(dtype) if dtype == torch.uint8 else values
+        values = values > 0 if dtype == torch.bool else values.to(dtype)
+        for row, length in enumerate(lengths):
+            values[row, length:] = values[row, length].clone()
+        return values
+
+    image, state = chain(3, SIZE, SIZE, dtype=torch.uint8), chain(7)
+    sim, count = chain(5, dtype=torch.float64), chain(1, dtype=torch.int64)
+    success = chain(1, dtype=torch.bool)
+    words = NonTensorStack(*(NonTensorData(f"do thing {row}", batch_size=[steps]) for row in range(rows)))
+
+    def observed(part: slice) -> dict:
+        return {
+            "observation": {"image": image[:, part], "state": state[:, part]},
+            keys.SIM_STATE: sim[:, part],
+            keys.NUM_STEPS: count[:, part],
+            keys.SUCCESS: success[:, part],
+            keys.TASK_ID: torch.full((rows, steps, 1), task),
+            keys.INSTRUCTION: words,
+        }
+
+    return TensorDict(
+        {
+            **observed(slice(0, -1)),
+            keys.ACTION: torch.randn(rows, steps, 7, generator=generator),
+            keys.CHUNK: torch.randn(rows, steps, 2, 7, generator=generator),
+            keys.LOG_PROBS: torch.randn(rows, steps, 2, generator=generator),
+            "returns": torch.randn(rows, steps, generator=generator),
+            keys.MASK: torch.arange(steps) < torch.tensor(lengths).unsqueeze(-1),
+            "next": {
+                **observed(slice(1, None)),
+                "reward": torch.randn(rows, steps, 1, generator=generator),
+                "done": done.unsqueeze(-1),
+            },
+        },
+        batch_size=[rows, steps],
+    )
+
+
+def decision_rollouts(executed: list[list[int]], chunk: int = 3, seed: int = 1) -> TensorDict:
+    """Rollouts [R, D] of chunks with their frames; the next image is the last executed frame."""
+    generator = torch.Generator().manual_seed(seed)
+    counts = torch.tensor(executed)
+    rows, decisions = counts.shape
+    frames = torch.randint(0, 256, (rows, decisions, chunk, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
+    mask = torch.arange(chunk) < counts.unsqueeze(-1)
+    row, decision = torch.meshgrid(torch.arange(rows), torch.arange(decisions), indexing="ij")
+    after = frames[row, decision, (counts - 1).clamp(min=0)]
+
+    def before(values: torch.Tensor, first: torch.Tensor) -> torch.Tensor:
+        return torch.cat([first, values[:, :-1]], 1)
+
+    start = torch.randint(0, 256, (rows, 1, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
+    return TensorDict(
+        {
+            "observation": {"image": before(after, start)},
+            keys.FRAMES: before(frames, torch.zeros_like(frames[:, :1])),
+            keys.STEP_MASK: before(mask, torch.zeros_like(mask[:, :1])),
+            keys.CHUNK: torch.randn(rows, decisions, chunk, 7, generator=generator),
+            keys.MASK: counts > 0,
+            "next": {
+                "observation": {"image": after},
+                keys.FRAMES: frames,
+                keys.STEP_MASK: mask,
+                "reward": torch.randn(rows, decisions, 1, generator=generator),
+            },
+        },
+        batch_size=[rows, decisions],
+    )
+
+
+def assert_same(read: TensorDict, written: TensorDict) -> None:
+    """Equal keys, shapes, dtypes and bits where the mask is True; zero elsewhere."""
+    assert read.batch_size == written.batch_size
+    assert set(read.keys(True, True)) == set(written.keys(True, True))
+    mask = written[keys.MASK]
+    for key in written.keys(True, True):
+        value, expected = read[key], written[key]
+        assert value.dtype == expected.dtype and value.shape == expected.shape, key
+        bits = [np.ascontiguousarray(each[mask].numpy()).tobytes() for each in (value, expected)]
+        assert bits[0] == bits[1], key
+        assert not value[~mask].any(), key
+
+
+def write(path, *rollouts: TensorDict, **options) -> None:
+    with RolloutWriter(path, **options) as writer:
+        for part in rollouts:
+            writer.write(part)
+
+
+def topics(path) -> dict[str, int]:
+    with open(path, "rb") as file:
+        summary = make_reader(file).get_summary()
+    return {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
+
+
+def test_single_steps_come_back_bit_for_bit(tmp_path):
+    rollouts = step_rollouts([6, 3, 1])
+    rollouts["next", "reward"][0, 0] = torch.nan
+    rollouts["observation", "state"][0, 0, 0] = -0.0
+    write(tmp_path / "a.mcap", rollouts)
+    read = read_rollouts(tmp_path / "a.mcap")
+    assert_same(read, rollouts)
+    assert read[0, 0].get(keys.INSTRUCTION).tolist() == "do thing 0"
+    assert read[:, 0].get(keys.INSTRUCTION).tolist() == ["do thing 0", "do thing 1", "do thing 2"]
+
+
+def test_decisions_come_back_bit_for_bit_with_a_stop_inside_a_chunk(tmp_path):
+    rollouts = decision_rollouts([[3, 2, 0], [3, 3, 3], [1, 0, 0]])
+    write(tmp_path / "a.mcap", rollouts)
+    assert_same(read_rollouts(tmp_path / "a.mcap"), rollouts)
+
+
+def test_an_image_is_stored_once(tmp_path):
+    write(tmp_path / "steps.mcap", step_rollouts([6, 3]))
+    assert topics(tmp_path / "steps.mcap")["/observation/image"] == 7 + 4
+    write(tmp_path / "decisions.mcap", decision_rollouts([[3, 2]]))
+    found = topics(tmp_path / "decisions.mcap")
+    assert found["/observation/image"] == 1 + 5 and found["/observation/image/after_stop"] == 1
+
+
+def test_root_and_next_values_that_differ_are_both_stored(tmp_path):
+    rollouts = step_rollouts([6, 6])
+    rollouts["next", "observation", "image"] = rollouts["next", "observation", "image"].flip(-1)
+    rollouts["next", keys.NUM_STEPS] = rollouts["next", keys.NUM_STEPS] + 1
+    rollouts["next", keys.SIM_STATE] = rollouts["next", keys.SIM_STATE].float()
+    write(tmp_path / "a.mcap", rollouts)
+    assert_same(read_rollouts(tmp_path / "a.mcap"), rollouts)
+
+
+def test_decisions_whose_image_is_no_frame_come_back_too(tmp_path):
+    rollouts = decision_rollouts([[3, 2], [3, 3]])
+    rollouts["next", "observation", "image"] = 255 - rollouts["next", "observation", "image"]
+    rollouts[keys.FRAMES] = rollouts[keys.FRAMES] + 1
+    write(tmp_path / "a.mcap", rollouts)
+    assert_same(read_rollouts(tmp_path / "a.mcap"), rollouts)
+
+
+@pytest.mark.parametrize("batch", [(), (6,), (2, 3), (3, 2, 1)])
+def test_batch_dimensions_are_kept(tmp_path, batch):
+    count = int(np.prod(batch)) if batch else 1
+    rollouts = step_rollouts([3, 6, 1, 2, 5, 4][:count])
+    if batch == ():
+        rollouts = rollouts[0]
+        rollouts[keys.INSTRUCTION] = NonTensorData("do it", batch_size=[6])
+        rollouts["next", keys.INSTRUCTION] = NonTensorData("do it", batch_size=[6])
+    else:
+        rollouts = rollouts.reshape(*batch, 6)
+    write(tmp_path / "a.mcap", rollouts)
+    assert_same(read_rollouts(tmp_path / "a.mcap"), rollouts)
+
+
+def test_other_dtypes_come_back(tmp_path):
+    rollouts = step_rollouts([6, 3])
+    for index, dtype in enumerate((torch.float16, torch.bfloat16, torch.int32, torch.int8, torch.uint8)):
+        rollouts[f"extra_{index}"] = (torch.randn(2, 6, 3) * 50).to(dtype)
+    rollouts["scalar"] = torch.randn(2, 6)
+    rollouts["empty"] = torch.zeros(2, 6, 0)
+    write(tmp_path / "a.mcap", rollouts)
+    read = read_rollouts(tmp_path / "a.mcap")
+    for key in [f"extra_{index}" for index in range(5)] + ["scalar", "empty"]:
+        assert read[key].dtype == rollouts[key].dtype and read[key].shape == rollouts[key].shape
+        assert torch.equal(read[key][rollouts[keys.MASK]], rollouts[key][rollouts[keys.MASK]])
+
+
+def test_without_a_mask_a_rollout_ends_at_its_first_done(tmp_path):
+    rollouts = step_rollouts([2, 6])
+    write(tmp_path / "a.mcap", rollouts.exclude(keys.MASK))
+    assert_same(read_rollouts(tmp_path / "a.mcap"), rollouts)
+
+
+def test_several_writes_are_concatenated_and_padded(tmp_path):
+    first, second = step_rollouts([6, 3]), step_rollouts([4, 2, 1], steps=4, seed=5)
+    write(tmp_path / "a.mcap", first, second)
+    read = read_rollouts(tmp_path / "a.mcap")
+    assert read.batch_size == (5, 6)
+    assert_same(read[:2], first)
+    assert_same(read[2:, :4], second)
+    assert not read[keys.MASK][2:, 4:].any() and not read[keys.IMAGE][2:, 4:].any()
+
+
+def test_folders_and_patterns_read_all_their_files(tmp_path):
+    write(tmp_path / "a.mcap", step_rollouts([6, 3]))
+    write(tmp_path / "b.mcap", step_rollouts([5], seed=2))
+    partial = RolloutWriter(tmp_path / "c.mcap")
+    partial.write(step_rollouts([6], seed=3))
+    assert read_rollouts(tmp_path).batch_size == (3, 6)
+    assert read_rollouts(str(tmp_path / "[ab].mcap")).batch_size == (3, 6)
+    partial.close()
+    assert read_rollouts(tmp_path).batch_size == (4, 6)
+
+
+def test_files_with_other_entries_are_not_mixed(tmp_path):
+    write(tmp_path / "a.mcap", step_rollouts([6]))
+    write(tmp_path / "b.mcap", step_rollouts([6]).exclude(keys.SIM_STATE, ("next", keys.SIM_STATE)))
+    with pytest.raises(ValueError, match=r"b\.mcap and .*a\.mcap hold different entries .*sim_state"):
+        read_rollouts(tmp_path)
+
+
+def test_metadata_and_attachments_come_before_the_rollouts(tmp_path):
+    metadata = {"tasks": ["goal/a"], "seed": 3, "note": "grün", "config": {"lr": 1e-3}}
+    model = tmp_path / "model.xml"
+    model.write_text("<mujoco/>")
+    attachments = {"model.xml": model, "raw": b"\x00\x01", "text": "hello"}
+    write(tmp_path / "a.mcap", step_rollouts([6]), metadata=metadata, attachments=attachments)
+    assert read_metadata(tmp_path / "a.mcap") == metadata
+    read = read_attachments(tmp_path / "a.mcap")
+    assert read == {"model.xml": b"<mujoco/>", "raw": b"\x00\x01", "text": b"hello"}
+
+
+def test_a_task_selects_its_rollouts(tmp_path):
+    tasks = ["goal/open_the_top_drawer", "goal/turn_on_the_stove"]
+    from worldenv_trl.scenes import load_task
+
+    parts = [step_rollouts([6, 3], seed=i, task=load_task(name).task_id) for i, name in enumerate(tasks)]
+    write(tmp_path / "a.mcap", *parts, metadata={"tasks": tasks})
+    assert_same(read_rollouts(tmp_path / "a.mcap", task=tasks[1]), parts[1])
+    with pytest.raises(ValueError, match=r"a\.mcap is of goal/open_the_top_drawer, .*not of goal/put"):
+        read_rollouts(tmp_path / "a.mcap", task="goal/put_the_bowl_on_the_plate")
+    write(tmp_path / "b.mcap", parts[0])
+    with pytest.raises(ValueError, match="does not say of which tasks"):
+        read_rollouts(tmp_path / "b.mcap", task=tasks[0])
+
+
+def test_messages_are_typed_and_images_viewable(tmp_path):
+    """Read by the official MCAP reader and protobuf runtime, which know nothing of this package."""
+    pool = pytest.importorskip("google.protobuf.descriptor_pool")
+    from google.protobuf import descriptor_pb2, message_factory
+
+    rollouts = step_rollouts([6, 3])
+    write(tmp_path / "a.mcap", rollouts)
+    decoded: dict[str, list] = {}
+    pools: dict[int, object] = {}
+    with open(tmp_path / "a.mcap", "rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            if schema.id not in pools:
+                files = descriptor_pb2.FileDescriptorSet.FromString(schema.data)
+                known = pool.DescriptorPool()
+                for each in files.file:
+                    known.Add(each)
+                pools[schema.id] = message_factory.GetMessageClass(known.FindMessageTypeByName(schema.name))
+            decoded.setdefault(channel.topic, []).append(pools[schema.id].FromString(message.data))
+    assert [(m.rollout, m.step) for m in decoded["/step"]] == [(0, i) for i in range(6)] + [(1, i) for i in range(3)]
+    step = decoded["/step"][7]
+    assert np.allclose(step.action, rollouts[keys.ACTION][1, 1], atol=0)
+    assert step.reward == rollouts["next", "reward"][1, 1].item()
+    assert list(step.observation_state) == rollouts["next", "observation", "state"][1, 1].tolist()
+    assert list(decoded["/reset"][1].sim_state) == rollouts[keys.SIM_STATE][1, 0].tolist()
+    image = decoded["/observation/image"][1]
+    assert (image.encoding, image.width, image.height, image.step) == ("rgb8", SIZE, SIZE, 3 * SIZE)
+    pixels = torch.frombuffer(bytearray(image.data), dtype=torch.uint8).view(SIZE, SIZE, 3).permute(2, 0, 1)
+    assert torch.equal(pixels, rollouts["next", "observation", "image"][0, 0])
+    assert "do thing 1" in decoded["/instruction"][1].message
+    position = decoded["/hand"][0].pose.position
+    assert [position.x, position.y, position.z] == rollouts["next", "observation", "state"][0, 0, :3].tolist()
+
+
+def test_log_times_never_go_back_on_a_topic(tmp_path):
+    write(tmp_path / "a.mcap", step_rollouts([6, 3]), step_rollouts([2], seed=4))
+    times: dict[str, list[int]] = {}
+    with open(tmp_path / "a.mcap", "rb") as file:
+        for _, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            times.setdefault(channel.topic, []).append(message.log_time)
+    for topic, stamps in times.items():
+        assert all(a < b for a, b in itertools.pairwise(stamps)), topic
+
+
+def test_metadata_must_be_plain(tmp_path):
+    with pytest.raises(ValueError, match="plain values"):
+        RolloutWriter(tmp_path / "a.mcap", metadata={"policy": object()})
+    assert json.dumps([p.name for p in tmp_path.iterdir()]) == "[]"
