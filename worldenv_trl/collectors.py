@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
+from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -17,11 +19,13 @@ from worldenv_trl import keys
 __all__ = ["GroupCollector"]
 
 
-class GroupCollector:
+class GroupCollector(BaseCollector):
     """Waves of rollouts in which every row runs to its own end: groups are complete, none is cut or started twice.
 
-    Stock collectors reset rows as they finish, which leaves the groups of a leave-one-out baseline unfinished and biased.
-    Here a wave resets all rows, rolls until every row is done, and marks what each rollout executed.
+    Stock collectors reset rows as they finish, which leaves the groups of a leave-one-out baseline unfinished and
+    biased. Here a wave resets all rows, rolls until every row is done, and marks what each rollout executed.
+
+    Where TorchRL's collectors count frames, this one counts groups; the rest of the interface is theirs.
 
     Args:
         env: batch ``[G, N]``, or a flat ``[G * N]`` with ``group_size=N`` (consecutive rows are a group).
@@ -36,11 +40,11 @@ class GroupCollector:
 
     Yields:
         TensorDict ``[groups, N, T]`` as ``env.rollout`` writes it, with ``("collector", "mask")`` bool [groups, N, T]:
-        False after a rollout's end, and ``returns`` float32 [groups, N, T]: the sum of the rollout's rewards, the same at
-        each of its entries.
+        False after a rollout's end, and ``returns`` float32 [groups, N, T]: the sum of the rollout's rewards, the same
+        at each of its entries.
 
     Raises:
-        ValueError: if sizes do not divide.
+        ValueError: if sizes do not divide or are below 1.
 
     Examples:
         >>> for batch in GroupCollector(env, actor, groups_per_batch=24, total_groups=240):
@@ -58,6 +62,7 @@ class GroupCollector:
         max_decisions: int | None = None,
         exploration_type: ExplorationType = ExplorationType.RANDOM,
     ) -> None:
+        super().__init__()
         shape = tuple(env.batch_size)
         if len(shape) == 1:
             size = 1 if group_size is None else group_size
@@ -72,17 +77,20 @@ class GroupCollector:
             )
         if total_groups != -1 and (total_groups < 1 or total_groups % groups_per_batch):
             raise ValueError(f"total_groups must be -1 or a multiple of {groups_per_batch}, got {total_groups}")
+        if max_decisions is not None and max_decisions < 1:
+            raise ValueError(f"max_decisions must be at least 1, got {max_decisions}")
         self.env, self.policy = env, policy
         self.group_shape = shape
         self.groups_per_batch, self.total_groups = groups_per_batch, total_groups
         self.max_decisions = 10_000 if max_decisions is None else max_decisions
         self.exploration_type = exploration_type
-        self._groups = 0
+        self._groups = self._frames = 0
+        self._iter = -1
         self.closed = False
 
-    def __iter__(self) -> Iterator[TensorDictBase]:
+    def iterator(self) -> Iterator[TensorDictBase]:
         while self.total_groups == -1 or self._groups < self.total_groups:
-            yield self.next()
+            yield self._batch()
 
     def __len__(self) -> int:
         """Batches in all; raises ``RuntimeError`` for an endless collector."""
@@ -90,27 +98,35 @@ class GroupCollector:
             raise RuntimeError("this collector is endless (total_groups=-1): it has no length")
         return self.total_groups // self.groups_per_batch
 
-    def next(self) -> TensorDictBase:
-        """The next batch of complete groups."""
+    def _batch(self) -> TensorDictBase:
         if self.closed:
             raise RuntimeError("this collector was shut down: make a new one")
+        if self.pre_collect_hook is not None:
+            self.pre_collect_hook()
         waves = [self._wave() for _ in range(self.groups_per_batch // self.group_shape[0])]
         length = max(wave.shape[-1] for wave in waves)
         batch = waves[0] if len(waves) == 1 else torch.cat([_padded(wave, length) for wave in waves], 0)
         self._groups += self.groups_per_batch
+        self._frames += int(batch[keys.MASK].sum())
+        self._iter += 1
+        if self.post_collect_hook is not None:
+            self.post_collect_hook(batch)
         return batch
 
     @torch.no_grad()
     def _wave(self) -> TensorDictBase:
-        training = isinstance(self.policy, nn.Module) and self.policy.training
-        if training:
-            self.policy.eval()
-        with set_exploration_type(self.exploration_type):
-            rollout = self.env.rollout(
-                self.max_decisions, self.policy, break_when_any_done=False, break_when_all_done=True
-            )
-        if training:
-            self.policy.train()
+        modules = list(self.policy.modules()) if isinstance(self.policy, nn.Module) else []
+        training = [module for module in modules if module.training]
+        try:
+            for module in training:
+                module.training = False
+            with set_exploration_type(self.exploration_type):
+                rollout = self.env.rollout(
+                    self.max_decisions, self.policy, break_when_any_done=False, break_when_all_done=True
+                )
+        finally:
+            for module in training:
+                module.training = True
         rollout = rollout.reshape(*self.group_shape, rollout.shape[-1])
         done = rollout["next", "done"].squeeze(-1)  # [G, N, T]
         # A finished row repeats its last entry, reward included: only what comes up to the first done belongs to it.
@@ -120,41 +136,48 @@ class GroupCollector:
         rollout["returns"] = torch.where(mask, rewards, 0.0).sum(-1, keepdim=True).expand_as(rewards).contiguous()
         return rollout
 
-    def update_policy_weights_(self, policy_or_weights: Any = None, **_: Any) -> None:
-        """Loads weights into the behaviour policy (a module, a state dict or a TensorDict of parameters).
+    def update_policy_weights_(
+        self, policy_or_weights: Any = None, *, weights: Any = None, policy: nn.Module | None = None, **_: Any
+    ) -> None:
+        """Loads weights into the behaviour policy: a module, a state dict or a TensorDict of parameters.
 
         Without an argument it does nothing: the collector calls the very policy it was given.
         """
-        if policy_or_weights is None or policy_or_weights is self.policy:
+        given = [source for source in (policy_or_weights, weights, policy) if source is not None]
+        if len(given) > 1:
+            raise ValueError("give the weights once: positionally, as weights=..., or as policy=...")
+        if not given or given[0] is self.policy:
             return
-        if isinstance(policy_or_weights, nn.Module):
-            self.policy.load_state_dict(policy_or_weights.state_dict())
-        elif isinstance(policy_or_weights, TensorDictBase):
-            policy_or_weights.data.to_module(self.policy, inplace=True)
+        if isinstance(given[0], TensorDictBase):
+            TensorDict.from_module(self.policy).data.update_(given[0].data)
         else:
-            self.policy.load_state_dict(policy_or_weights)
+            state = given[0].state_dict() if isinstance(given[0], nn.Module) else given[0]
+            self.policy.load_state_dict(state)
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seeds the env and torch (the policy's samples); returns the env's next seed."""
         torch.manual_seed(seed)
         return self.env.set_seed(seed, static_seed=static_seed)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> OrderedDict[str, Any]:
         """Progress and the policy's weights."""
         policy = self.policy.state_dict() if isinstance(self.policy, nn.Module) else {}
-        return {"groups": self._groups, "policy_state_dict": policy}
+        progress = {"groups": self._groups, "frames": self._frames, "iter": self._iter}
+        return OrderedDict(progress, policy_state_dict=policy)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._groups = int(state_dict["groups"])
+        self._groups, self._frames = int(state_dict["groups"]), int(state_dict["frames"])
+        self._iter = int(state_dict["iter"])
         if isinstance(self.policy, nn.Module):
             self.policy.load_state_dict(state_dict["policy_state_dict"])
 
-    def shutdown(self, **_: Any) -> None:
-        """Closes the env."""
-        if not self.closed:
-            self.closed = True
-            if not self.env.is_closed:
-                self.env.close()
+    def shutdown(self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True) -> None:
+        """Ends the collection and, unless told otherwise, closes the env."""
+        if self.closed:
+            return
+        self.closed = True
+        if close_env:  # is_closed is no guide: it is True from the start for envs that do not set it
+            self.env.close(raise_if_closed=False)
 
 
 def _padded(wave: TensorDictBase, length: int) -> TensorDictBase:

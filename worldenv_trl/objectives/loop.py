@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -10,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictParams, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torch.distributions import Distribution
 from torchrl.objectives.common import LossModule
 
 from worldenv_trl import keys
@@ -23,30 +25,35 @@ NORMALIZATIONS = ("global", "episode")
 class LOOPLoss(LossModule):
     r"""Clipped surrogate of World-Env Eq. 5,
 
-    .. math:: L = -\frac{1}{\sum_n T_n} \sum_n \sum_{t \le T_n} \min(r_t A_n, \mathrm{clip}(r_t, 1-\epsilon, 1+\epsilon) A_n),
+    .. math:: L = -\frac{1}{\sum_n T_n} \sum_n \sum_{t \le T_n}
+        \min(r_t A_n, \mathrm{clip}(r_t, 1-\epsilon, 1+\epsilon) A_n),
 
-    over the executed steps ``t`` of rollouts ``n``; ``r_t`` is the probability ratio of step ``t``'s action. Steps of a chunk
-    after a stop (``step_mask`` False), and decisions that belong to no rollout (``("collector", "mask")`` False), do not
-    count, in value or gradient.
+    over the executed steps ``t`` of rollouts ``n``; ``r_t`` is the probability ratio of step ``t``'s action. Steps of a
+    chunk after a stop (``step_mask`` False), and decisions that belong to no rollout (``("collector", "mask")`` False),
+    do not count, in value or gradient.
 
-    Reads decisions ``[*B]``: the actor's inputs, ``("vla_action", "chunk")`` [*B, C, 7], ``("vla_action", "log_probs")``
-    [*B, C], ``advantage`` [*B, 1], ``step_mask`` [*B, C], optionally ``("collector", "mask")`` [*B] and ``total_steps``
-    [*B, 1]: the executed steps of the whole batch (``normalize="global"``) or of the decision's own rollout
-    (``"episode"``). With it, the losses of minibatches, or of processes, add up exactly to the loss of the whole batch;
-    without it, the steps at hand are counted.
+    Reads decisions ``[*B]``: the actor's inputs, ``("vla_action", "chunk")`` [*B, C, 7],
+    ``("vla_action", "log_probs")`` [*B, C], ``advantage`` [*B, 1], ``step_mask`` [*B, C], optionally
+    ``("collector", "mask")`` [*B] and ``total_steps`` [*B, 1]: the executed steps of the whole batch
+    (``normalize="global"``) or of the decision's own rollout (``"episode"``). With it, the losses of minibatches, or of
+    processes, add up exactly to the loss of the whole batch; without it, the steps at hand are counted.
 
-    Returns ``loss_objective`` (scalar), and detached ``kl_approx`` (mean of ``(r - 1) - log r`` per step), ``clip_fraction``,
-    ``ESS`` (effective sample size as a share of the steps).
+    The step mask is an outcome of the decision: it is read below ``"next"`` where it exists there, as in every rollout
+    (whose root entry belongs to the decision before), and at the root otherwise.
+
+    Returns ``loss_objective`` (scalar), and detached ``kl_approx`` (mean of ``(r - 1) - log r`` per step),
+    ``clip_fraction``, ``ESS`` (effective sample size as a share of the steps).
 
     Args:
         actor: writes a distribution over chunks whose log-prob is [*B, C] (``event_dims=1``).
 
     Keyword Args:
         clip_epsilon: ``epsilon``, or ``(low, high)``.
-        ratio_level: ``step`` (the paper); ``chunk``: one ratio for the executed steps of a chunk, counted once for each of
-            them; ``dim``: one for each action dimension, averaged (needs log-probs [*B, C, 7], ``event_dims=0``).
-        normalize: ``global`` (the paper) weighs every step equally, ``episode`` every rollout. The latter needs
-            ``total_steps`` and divides by the number of rollouts, ``num_rollouts`` [*B, 1].
+        ratio_level: ``step`` (the paper); ``chunk``: one ratio for the executed steps of a chunk, counted once for each
+            of them; ``dim``: one for each action dimension, averaged (needs log-probs [*B, C, 7], ``event_dims=0``).
+        normalize: ``global`` (the paper) weighs every step equally, ``episode`` every rollout. The latter reads
+            ``total_steps`` and the number of rollouts ``num_rollouts`` [*B, 1], or counts both if decisions are
+            ``[*rollouts, T]``, time last.
         functional: False keeps the actor's parameters in the actor (needed for adapters injected by peft, and FSDP).
 
     Raises:
@@ -54,7 +61,11 @@ class LOOPLoss(LossModule):
 
     Examples:
         >>> loss = LOOPLoss(actor, clip_epsilon=0.1)
-        >>> loss(decisions)["loss_objective"].backward()
+        >>> batch["advantage"] = rloo_advantage(batch["returns"][..., 0])[..., None, None].expand(*batch.shape, 1)
+        >>> decisions = batch[batch["collector", "mask"]]  # [M]
+        >>> decisions["total_steps"] = decisions["next", "step_mask"].sum().expand(len(decisions), 1)
+        >>> for minibatch in decisions.split(64):  # the gradients add up to that of loss(decisions)
+        ...     loss(minibatch)["loss_objective"].backward()
     """
 
     @dataclass
@@ -87,9 +98,6 @@ class LOOPLoss(LossModule):
             raise ValueError(f"ratio_level must be one of {', '.join(RATIO_LEVELS)}, got {ratio_level!r}")
         if normalize not in NORMALIZATIONS:
             raise ValueError(f"normalize must be one of {', '.join(NORMALIZATIONS)}, got {normalize!r}")
-        low, high = clip_epsilon if isinstance(clip_epsilon, tuple | list) else (clip_epsilon, clip_epsilon)
-        if not (0 < low < 1 and high > 0):
-            raise ValueError(f"clip_epsilon must be positive (and below 1 downwards), got {clip_epsilon}")
         self._functional = functional
         super().__init__()
         if functional:
@@ -97,11 +105,23 @@ class LOOPLoss(LossModule):
         else:
             self.actor_network, self.actor_network_params = actor, None
         self.ratio_level, self.normalize = ratio_level, normalize
-        self.register_buffer("clip_epsilon", torch.tensor([float(low), float(high)]))
+        self.clip_epsilon = clip_epsilon
 
     @property
     def functional(self) -> bool:
         return self._functional
+
+    @property
+    def clip_epsilon(self) -> tuple[float, float]:
+        """``(low, high)``; assign a number or a pair to schedule it."""
+        return self._clip_epsilon
+
+    @clip_epsilon.setter
+    def clip_epsilon(self, value: float | tuple[float, float]) -> None:
+        low, high = value if isinstance(value, tuple | list) else (value, value)
+        if not (0 < low < 1 and 0 < high < math.inf):
+            raise ValueError(f"clip_epsilon must be positive (and below 1 downwards), got {value}")
+        self._clip_epsilon = (float(low), float(high))
 
     def _forward_value_estimator_keys(self, **_: object) -> None:
         self._in_keys = None
@@ -119,74 +139,86 @@ class LOOPLoss(LossModule):
         chunk, before = tensordict.get(names.action), tensordict.get(names.sample_log_prob)
         if before.requires_grad:
             raise ValueError(f"{names.sample_log_prob} requires grad: collect rollouts under torch.no_grad()")
-        distribution = self._distribution(tensordict)
-        now = distribution.log_prob(chunk)
+        steps = self._executed(tensordict)  # [*B, C]
+        if steps.shape != chunk.shape[:-1]:
+            raise ValueError(f"{names.step_mask} must be {list(chunk.shape[:-1])}, got {list(steps.shape)}")
+        advantage = tensordict.get(names.advantage)
+        if advantage.shape != (*steps.shape[:-1], 1):
+            raise ValueError(f"{names.advantage} must be {[*steps.shape[:-1], 1]}, got {list(advantage.shape)}")
+
+        # Actions that were not executed must not reach the graph: 0 * NaN is NaN, also backwards.
+        chunk = torch.where(steps.unsqueeze(-1), chunk, 0.0)
+        now = self._distribution(tensordict).log_prob(chunk)
         if now.shape != before.shape:
             raise ValueError(
                 f"{names.sample_log_prob} is {list(before.shape)}, the actor scores {list(now.shape)}: "
                 "collect and train with the same event_dims"
             )
-        steps = self._executed(tensordict)  # [*B, C]
-        advantage = tensordict.get(names.advantage)
-        if advantage.shape != (*steps.shape[:-1], 1):
-            raise ValueError(f"{names.advantage} must be {[*steps.shape[:-1], 1]}, got {list(advantage.shape)}")
-
-        log_ratio = now - before
-        if self.ratio_level == "dim":
-            if log_ratio.ndim != steps.ndim + 1:
-                raise ValueError("ratio_level='dim' needs log-probs [*B, C, 7]: build the actor with event_dims=0")
-            advantage = advantage.unsqueeze(-1)
-            mask = steps.unsqueeze(-1).expand_as(log_ratio)
-        else:
-            if log_ratio.ndim == steps.ndim + 1:
-                log_ratio = log_ratio.sum(-1)
-            mask = steps
-        # Steps that were not executed must not reach the graph, not even as 0 * inf.
-        log_ratio = torch.where(mask, log_ratio, torch.zeros_like(log_ratio))
-        if self.ratio_level == "chunk":
-            log_ratio = log_ratio.sum(-1, keepdim=True).expand_as(steps)
-        ratio = log_ratio.exp()
+        log_ratio, mask, advantage = self._log_ratio(now - before, steps, advantage)
+        # min(r A, clip(r) A) is 0 for A = 0; taken out because a ratio that overflows would make it inf * 0.
+        ratio = torch.where(mask & (advantage != 0), log_ratio, 0.0).exp()
         low, high = self.clip_epsilon
-        clipped = ratio.clamp(1 - low, 1 + high)
-        gain = torch.minimum(ratio * advantage, clipped * advantage)
+        gain = torch.minimum(ratio * advantage, ratio.clamp(1 - low, 1 + high) * advantage)  # World-Env Eq. 5
+        gain = torch.where(mask, gain, 0.0)
         if self.ratio_level == "dim":
             gain = gain.mean(-1)
-        gain = torch.where(steps, gain, torch.zeros_like(gain)) * self._weight(tensordict, steps)
-        out = {"loss_objective": -gain.sum()} | self._diagnostics(log_ratio.detach(), mask)
-        return TensorDict(out)
+        loss = -(gain * self._weight(tensordict, steps, gain.dtype)).sum()
+        return TensorDict({"loss_objective": loss} | self._diagnostics(log_ratio.detach(), mask))
 
-    def _distribution(self, tensordict: TensorDictBase):
+    def _distribution(self, tensordict: TensorDictBase) -> Distribution:
         if self.functional:
-            with self.actor_network_params.to_module(self.actor_network):
+            with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
                 return self.actor_network.get_dist(tensordict)
         return self.actor_network.get_dist(tensordict)
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
-        steps = tensordict.get(self.tensor_keys.step_mask)
+        key = self.tensor_keys.step_mask
+        steps = tensordict.get(("next", *((key,) if isinstance(key, str) else key)), None)
+        if steps is None:
+            steps = tensordict.get(key)
         mask = tensordict.get(self.tensor_keys.mask, None)
         return steps if mask is None else steps & mask.reshape(*steps.shape[:-1], 1)
 
-    def _weight(self, tensordict: TensorDictBase, steps: Tensor) -> Tensor:
+    def _log_ratio(self, difference: Tensor, steps: Tensor, advantage: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Log-ratios, zero where nothing was executed, their mask and advantage: [*B, C], or [*B, C, 7] for ``dim``."""
+        if difference.ndim not in (steps.ndim, steps.ndim + 1):
+            raise ValueError(f"log-probs must be [*B, C] or [*B, C, 7], got {list(difference.shape)}: use event_dims=1")
+        each = difference.ndim == steps.ndim + 1
+        if self.ratio_level == "dim":
+            if not each:
+                raise ValueError("ratio_level='dim' needs log-probs [*B, C, 7]: build the actor with event_dims=0")
+            mask = steps.unsqueeze(-1).expand_as(difference)
+            return torch.where(mask, difference, 0.0), mask, advantage.unsqueeze(-1)
+        difference = torch.where(steps, difference.sum(-1) if each else difference, 0.0)
+        if self.ratio_level == "chunk":
+            difference = difference.sum(-1, keepdim=True).expand_as(steps)
+        return difference, steps, advantage
+
+    def _weight(self, tensordict: TensorDictBase, steps: Tensor, dtype: torch.dtype) -> Tensor:
         """What each executed step counts, broadcastable to ``[*B, C]``."""
         names = self.tensor_keys
         total = tensordict.get(names.total_steps, None)
         if self.normalize == "global":
-            return 1 / (steps.sum().clamp_min(1) if total is None else total).to(torch.float32)
+            return 1 / (steps.sum().clamp_min(1) if total is None else total).to(dtype)
         rollouts = tensordict.get(names.num_rollouts, None)
+        if total is None and rollouts is None and steps.ndim >= 3:  # [*rollouts, T, C]
+            total = steps.sum((-2, -1), keepdim=True)
+            rollouts = (total > 0).sum().clamp_min(1)
+            total = total.clamp_min(1)
         if total is None or rollouts is None:
             raise ValueError(
-                f"normalize='episode' needs {names.total_steps!r} (steps of the decision's rollout) and {names.num_rollouts!r}, both [*B, 1]"
+                f"normalize='episode' needs {names.total_steps!r} (steps of the decision's rollout) and "
+                f"{names.num_rollouts!r}, both [*B, 1], unless decisions are [*rollouts, T]"
             )
-        return 1 / (total * rollouts).to(torch.float32)
+        return 1 / (total * rollouts).to(dtype)
 
     def _diagnostics(self, log_ratio: Tensor, mask: Tensor) -> dict[str, Tensor]:
         count = mask.sum().clamp_min(1)
-        ratio = log_ratio.exp()
+        ratio = torch.where(mask, log_ratio.exp(), 0.0)
         low, high = self.clip_epsilon
         outside = ((ratio < 1 - low) | (ratio > 1 + high)) & mask
-        weight = torch.where(mask, ratio, torch.zeros_like(ratio))
         return {
-            "kl_approx": torch.where(mask, ratio - 1 - log_ratio, torch.zeros_like(ratio)).sum() / count,
+            "kl_approx": torch.where(mask, ratio - 1 - log_ratio, 0.0).sum() / count,
             "clip_fraction": outside.sum() / count,
-            "ESS": weight.sum().square() / weight.square().sum().clamp_min(1e-12) / count,
+            "ESS": ratio.sum().square() / ratio.square().sum().clamp_min(1e-12) / count,
         }
