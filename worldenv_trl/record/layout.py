@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -62,12 +63,10 @@ class Layout:
     steps_per_entry: int  # C for decisions, else 1
 
     @classmethod
-    def of(cls, rollouts: TensorDictBase, valid: Tensor) -> Layout:
-        """The layout that stores ``rollouts`` [*B, T] without loss where ``valid`` bool [R, T]."""
-        tensors, texts = leaves(rollouts)
-        tensors.pop(MASK, None)
+    def of(cls, flat: dict[tuple[str, ...], Tensor], texts: Iterable[tuple[str, ...]], valid: Tensor) -> Layout:
+        """The layout that keeps tensors [R, T, ...] by path without loss where ``valid`` bool [R, T]."""
+        flat = {key: value for key, value in flat.items() if key != MASK}
         count = valid.shape[0]
-        flat = {key: value.reshape(*valid.shape, *value.shape[rollouts.ndim :]) for key, value in tensors.items()}
         images: list[Entry] = []
         numbers: list[Entry] = []
         for key, value in flat.items():

@@ -115,8 +115,8 @@ class RolloutWriter:
             raise ValueError(f"rollouts must be [*B, T] with at least one entry, got {list(rollouts.shape)}")
         tensors, texts = leaves(rollouts)
         valid = executed_entries(rollouts)
-        layout = Layout.of(rollouts, valid)
         flat = {key: value.reshape(*valid.shape, *value.shape[rollouts.ndim :]) for key, value in tensors.items()}
+        layout = Layout.of(flat, texts, valid)
         lengths = valid.sum(-1)
         texts = {path: _row_texts(path, value, valid.shape, lengths) for path, value in texts.items()}
         raw = sum(int(lengths.sum()) * e.nbytes for e in (*layout.images, *layout.numbers))
