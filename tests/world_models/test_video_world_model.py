@@ -97,7 +97,7 @@ def test_an_untrained_model_copies_the_last_frame():
     td["poses"][:] = td["memory", "poses"][:, -1:]
     last = td["memory", "frames"][:, -1:].float()
     painted = model(td)[FRAMES].float()
-    assert (painted - last).abs().mean() < 0.1 * (last - 127.5).abs().mean()
+    assert (painted - last).abs().mean() < 0.4 * (last - 127.5).abs().mean()
 
 
 def test_a_pixel_at_the_tool_can_follow_the_tool_exactly():
@@ -106,6 +106,37 @@ def test_a_pixel_at_the_tool_can_follow_the_tool_exactly():
     shift = torch.tensor([3.0, -2.0]).view(1, 1, 1, 1, 1, 2)
     moved = from_cells(model.denoiser._move(image, shift), 2)[0, 0]
     assert torch.allclose(moved[:, 4:26, 8:28], image[0, :, 6:28, 5:25], atol=1e-5)
+
+
+def test_the_hand_texture_lies_on_the_plane_of_the_tool_y_and_z_axes(model):
+    """Projected points of that plane map to their own plane coordinates: affinely, so only near the tool exactly."""
+    poses = torch.zeros(1, 2, 13)
+    poses[..., :3] = torch.tensor([[0.1, -0.05, 0.2], [-0.1, 0.1, 0.1]])
+    turn = torch.tensor(0.4)
+    down = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+    yaw = torch.tensor([[turn.cos(), -turn.sin(), 0], [turn.sin(), turn.cos(), 0], [0, 0, 1]])
+    poses[..., 3:12] = torch.stack([down, yaw @ down]).flatten(1)
+    task = torch.full((1, 1), 3)
+    affine = model._hand_plane(poses, model.action_map.project(poses[..., :3], task), task)
+    axes = poses[..., 3:12].unflatten(-1, (3, 3))
+    for y, z in ((0.0, 0.0), (0.03, 0.0), (0.0, -0.03), (-0.02, 0.02)):
+        point = poses[..., :3] + y * axes[..., 1] + z * axes[..., 2]
+        image = model.action_map.project(point, task) * 2 / model.action_map.height - 1
+        plane = (affine[..., :2] @ image.unsqueeze(-1)).squeeze(-1) + affine[..., 2]
+        expected = torch.tensor([y / 0.14, (z + 0.10) / 0.16])
+        assert torch.allclose(plane, expected.expand_as(plane), atol=0.04)
+
+
+def test_a_hand_seen_edge_on_gives_finite_frames(model):
+    td = request(1)
+    # The y axis along the camera's view: its projection is a point.
+    axis = torch.nn.functional.normalize(torch.tensor([1.2, 0.0, 0.8]), dim=0)
+    side = torch.tensor([0.0, 1.0, 0.0])
+    td["poses"][..., :3] = 0.0
+    td["poses"][..., 3:12] = torch.stack([side, axis, torch.linalg.cross(side, axis)], -1).flatten()
+    conditions = model.conditions(td)
+    assert conditions["hand"].isfinite().all()
+    assert model.predict(None, torch.zeros(1), conditions).isfinite().all()
 
 
 @pytest.mark.parametrize("patch", [1, 2, 4])

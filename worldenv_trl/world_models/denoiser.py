@@ -8,7 +8,9 @@ from torch import Tensor, nn
 
 __all__ = ["Denoiser", "from_cells", "to_cells"]
 
-_CANDIDATES = 4  # last frame, first frame, moved last frame, painted
+_CANDIDATES = 5  # last frame, first frame, moved last frame, painted, hand
+_HAND_TEXELS = (40, 36)  # about the image's resolution for a hand 0.3 m long
+_HAND_GAIN = 25.0  # the texture has much further to travel than a weight of the network
 
 
 def to_cells(images: Tensor, patch: int) -> Tensor:
@@ -35,7 +37,9 @@ class Denoiser(nn.Module):
     - the first frame (what the arm uncovers),
     - the last frame moved along with the tool's motion on the image plus a predicted residual flow (the arm, and what
       it holds or pushes, stay sharp instead of being painted again in every chunk),
-    - freely painted colour.
+    - freely painted colour,
+    - the hand: a learned texture on a plane that the tool carries, shown where projection puts it (one texture for open
+      fingers, one for closed). It stays sharp because all frames of all episodes share it.
 
     Chunks are handled as cells [B, C, 3, P, h, w], P = patch^2 (:func:`to_cells`), the layout of the finest grid:
     nothing is reordered between network, composition and loss.
@@ -109,6 +113,7 @@ class Denoiser(nn.Module):
             self.paint.bias.zero_()
             self.paint.bias[: patch**2] = 2.0  # starts as a copy of the last frame
 
+        self.hand = nn.Parameter(torch.zeros(1, 2 * 4, *_HAND_TEXELS))  # closed and open: colour, weight
         axis = (torch.arange(image_size, dtype=torch.float32) + 0.5) * 2 / image_size - 1
         base = torch.stack([to_cells(plane, patch) for plane in torch.meshgrid(axis, axis, indexing="xy")], -1)
         self.register_buffer("_base", base, persistent=False)  # where every pixel is: [P, h, w, 2]
@@ -121,6 +126,8 @@ class Denoiser(nn.Module):
         memory_maps: Tensor,
         maps: Tensor,
         motion: Tensor,
+        hand: Tensor,
+        opening: Tensor,
         poses: Tensor,
         condition: Tensor,
         reference: Tensor,
@@ -135,6 +142,8 @@ class Denoiser(nn.Module):
             memory_maps: [B, M, K, h, w], action maps and tool coordinates of the remembered frames.
             maps: [B, C, K, h, w], the same of the frames to paint.
             motion: [B, C, 2], the tool's motion on the image since the last frame, in pixels.
+            hand: [B, C, 2, 3], affine map from the image's coordinates to those of the hand's texture, both in [-1, 1].
+            opening: [B, C], of the gripper.
             poses: [B, C, D'], the pose of every frame to paint.
             condition: [B, D], poses and actions of the whole chunk.
             reference: [B, 3, H, W].
@@ -180,16 +189,38 @@ class Denoiser(nn.Module):
         if frames is not None:
             every = (torch.arange(batch, device=frames.device).unsqueeze(-1) * chunk + frames).flatten()
             decoded, per_frame, motion = decoded[every], per_frame[every], motion[:, frames]
+            hand, opening = hand[:, frames], opening[:, frames]
         decoded = F.silu(self.frame_out(torch.cat([decoded, per_frame], 1)))
         painted = self.paint(decoded).float().contiguous().unflatten(1, (-1, self.patch**2))
         painted = painted.unflatten(0, (batch, motion.shape[1]))
-        weight = painted[:, :, :_CANDIDATES].softmax(2).unsqueeze(3)  # [B, C, 4, 1, P, h, w]
+        sprite = self._hand(hand, opening)  # [B, C, 4, P, h, w]
+        weight = torch.cat(
+            [painted[:, :, : _CANDIDATES - 1], painted[:, :, _CANDIDATES - 1 : _CANDIDATES] + sprite[:, :, 3:]], 2
+        )
+        weight = weight.softmax(2).unsqueeze(3)  # [B, C, 5, 1, P, h, w]
         colour, flow = painted[:, :, _CANDIDATES : _CANDIDATES + 3], painted[:, :, _CANDIDATES + 3 :]
         moved = self._move(memory[:, -1], motion + flow.movedim(2, -1))
         chosen = weight[:, :, 0] * remembered[:, None, -1]
         chosen = torch.addcmul(chosen, weight[:, :, 1], remembered[:, None, 0])
         chosen = torch.addcmul(chosen, weight[:, :, 2], moved)
-        return torch.addcmul(chosen, weight[:, :, 3], colour)
+        chosen = torch.addcmul(chosen, weight[:, :, 3], colour)
+        return torch.addcmul(chosen, weight[:, :, 4], sprite[:, :, :3])
+
+    def _hand(self, affine: Tensor, opening: Tensor) -> Tensor:
+        """Colour and weight of the hand's texture at every pixel: [B, C, 2, 3], [B, C] -> [B, C, 4, P, h, w]."""
+        (batch, chunk), (cell, height, width, _) = opening.shape, self._base.shape
+        with torch.autocast(affine.device.type, enabled=False):
+            grid = self._base @ affine[..., :2].mT.view(batch, chunk, 1, 1, 2, 2) + affine[..., 2].view(
+                batch, chunk, 1, 1, 1, 2
+            )
+            sampled = F.grid_sample(
+                _HAND_GAIN * self.hand, grid.reshape(1, -1, width, 2), padding_mode="zeros", align_corners=False
+            )
+            inside = (grid.abs().amax(-1) < 1).view(batch, chunk, 1, cell, height, width)
+        sampled = sampled.view(2, 4, batch, chunk, cell, height, width).movedim(1, 3)  # [2, B, C, 4, P, h, w]
+        sampled = torch.lerp(sampled[0], sampled[1], opening.clamp(0, 1).view(batch, chunk, 1, 1, 1, 1))
+        colour, weight = sampled[:, :, :3], sampled[:, :, 3:].masked_fill(~inside, -8.0)
+        return torch.cat([colour, weight], 2)
 
     def _move(self, image: Tensor, motion: Tensor) -> Tensor:
         """``image`` [B, 3, H, W] moved by pixels [B, C, P or 1, h or 1, w or 1, 2]: cells [B, C, 3, P, h, w]."""

@@ -29,6 +29,8 @@ NOISE_SEED = "noise_seed"  # int64 [B, 1]
 
 PADDED_ACTION_DIM = 14
 _MEMORY = 3  # first frame, the frame memory_stride back, last frame
+_HAND_CENTRE = (0.0, -0.10)  # metres along the tool's y and z axes from the tool centre
+_HAND_HALF_SIZE = (0.14, 0.16)
 _POSITION_SCALE = 10.0  # metres to the unit scale of the network's other inputs
 
 
@@ -201,6 +203,8 @@ class VideoWorldModel(TensorDictModuleBase, Pretrained):
             "memory_maps": maps[:, :_MEMORY],
             "maps": maps[:, _MEMORY:],
             "motion": motion.clamp(-self.config.image_size, self.config.image_size),
+            "hand": self._hand_plane(poses, pixels[:, _MEMORY:], task_id),
+            "opening": poses[..., 12],
             "poses": vectors[:, _MEMORY:],
             "condition": torch.cat([vectors.flatten(1), tensordict[PADDED_ACTIONS].float().flatten(1)], -1),
             "reference": to_float(tensordict[REFERENCE]),
@@ -231,6 +235,34 @@ class VideoWorldModel(TensorDictModuleBase, Pretrained):
         across = offset[..., ::2, None, :].expand(*pixels.shape[:-1], 2, side, side)
         down = offset[..., 1::2, :, None].expand(*pixels.shape[:-1], 2, side, side)
         return torch.cat([across, down], -3)
+
+    @torch.no_grad()
+    def _hand_plane(self, poses: Tensor, origin: Tensor, task_id: Tensor) -> Tensor:
+        """Image coordinates -> coordinates on the plane of the tool's y and z axes (affine): [B, C, 2, 3].
+
+        Args:
+            poses: [B, C, 13].
+            origin: [B, C, 2], the projected tool centre in cells.
+            task_id: [B, 1].
+        """
+        side, reach = self.action_map.height, 0.05
+        axes = poses[..., 3:12].unflatten(-1, (3, 3)).mT[..., 1:, :]  # [B, C, axis y or z, 3]
+        ends = torch.stack(
+            [self.action_map.project(poses[..., :3] + reach * axes[..., i, :], task_id) for i in (0, 1)], -1
+        )
+        # Image coordinates in [-1, 1] per metre along y and z: [B, C, 2, 2].
+        jacobian = (ends - origin.unsqueeze(-1)) * (2 / side / reach)
+        (a, b), (c, d) = (row.unbind(-1) for row in jacobian.unbind(-2))
+        # A plane seen edge-on would be sampled infinitely wide.
+        det = a * d - b * c
+        least = 0.1 * (b.square() + d.square()) + 1e-2
+        det = torch.where(det < 0, -1.0, 1.0) * det.abs().clamp(min=least)
+        inverse = torch.stack([torch.stack([d, -b], -1), torch.stack([-c, a], -1)], -2) / det[..., None, None]
+        half = inverse.new_tensor(_HAND_HALF_SIZE).unsqueeze(-1)
+        matrix = inverse / half
+        centre = origin * (2 / side) - 1
+        offset = -(matrix @ centre.unsqueeze(-1)) - inverse.new_tensor(_HAND_CENTRE).unsqueeze(-1) / half
+        return torch.cat([matrix, offset], -1)
 
     @staticmethod
     def _pose_vectors(poses: Tensor) -> Tensor:
