@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from worldenv_trl.keys import ACTION_DIM, POSITION_STEP, ROTATION_STEP
-from worldenv_trl.scenes import controller
+from worldenv_trl.scenes import controller, predicates
 from worldenv_trl.scenes.objects import Bowl, Cabinet, Plate, Stove
 
 if TYPE_CHECKING:
@@ -118,6 +118,9 @@ def _put_on(bowl: str, plate: str) -> list[_Phase]:
     def held(scene: SceneBatch) -> np.ndarray:
         return np.linalg.norm(_tcp(scene) - _body(scene, bowl), axis=-1) < 2 * Bowl.RIM_RADIUS
 
+    def placed(scene: SceneBatch) -> np.ndarray:
+        return predicates.on(scene, bowl, plate)
+
     # Deep enough that the pads carry the bowl level; slow at the end, so that it is set down rather than dropped.
     grip = Bowl.HEIGHT - 0.022
     return [
@@ -128,7 +131,7 @@ def _put_on(bowl: str, plate: str) -> list[_Phase]:
         _Phase(lambda s, m: over_plate(s, 0.06), _CLOSE, tolerance=0.010, still=held),
         _Phase(lambda s, m: over_plate(s, Plate.TOP - 0.001), _CLOSE, tolerance=0.005, speed=0.2, still=held),
         _Phase(lambda s, m: m, _OPEN, tolerance=0.03, dwell=5, remember=_tcp),
-        _Phase(lambda s, m: m, _OPEN, remember=lambda s: np.add(_tcp(s), (0.0, 0.0, 0.10))),
+        _Phase(lambda s, m: m, _OPEN, remember=lambda s: np.add(_tcp(s), (0.0, 0.0, 0.10)), still=placed),
     ]
 
 

@@ -33,11 +33,11 @@ class Bowl(_Primitive):
     """
 
     RIM_RADIUS = 0.058
+    FOOT_RADIUS = 0.054
     HEIGHT = 0.05
-    BOTTOM = 0.0  # height of the lowest point below the origin
 
     def _shape(self, body: mjcf.Element) -> None:
-        foot, staves = 0.054, 12
+        foot, staves = self.FOOT_RADIUS, 12
         colour = {"rgba": (0.10, 0.10, 0.13, 1)}
         body.add("geom", name="foot", type="cylinder", pos=(0, 0, 0.004), size=(foot, 0.004), mass=0.03, **colour)
         lean = math.atan2(self.RIM_RADIUS - foot, self.HEIGHT)
@@ -137,7 +137,7 @@ class Stove(_Primitive):
     The burner glows when on: see ``Task.paint``.
     """
 
-    ON_ABOVE = 1.0
+    ON_ABOVE = 1.05  # sixty degrees
     PEG_RADIUS = 0.085  # lever axis to the peg that is pushed
     PIVOT = (-0.045, 0.0, 0.035)
     PEG_HEIGHT = 0.05

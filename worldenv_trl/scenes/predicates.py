@@ -1,7 +1,8 @@
 """Goal predicates with LIBERO's meaning, for all rows of a :class:`SceneBatch` at once.
 
-``On(a, b)``: a rests on b and their centres are within 3 cm. LIBERO asks MuJoCo for a contact; here the resting contact
-is read from the poses (a upright, its bottom at b's top), which the batch has for every row at no cost.
+``On(a, b)``: a rests on b and their centres are within 3 cm. LIBERO asks MuJoCo for a contact; here it is read from the
+poses, which the batch has for every row at no cost: a's foot is within a millimetre of b's top, and a is level. A bowl
+held askew with one edge on the plate does not count yet.
 """
 
 from __future__ import annotations
@@ -16,17 +17,18 @@ if TYPE_CHECKING:
     from worldenv_trl.scenes.simulation import SceneBatch
 
 ON_DISTANCE = 0.03  # LIBERO: horizontal distance of the centres
-RESTING_GAP = 0.004
-UPRIGHT = 0.95  # cosine of the tilt
+TOUCHING = 0.001  # between the foot's lowest point and what is below it
+LEVEL = 0.997  # cosine of the tilt: 4.4 degrees
 
 
 def on(scene: SceneBatch, top: str, bottom: str) -> np.ndarray:
     """``[n]``: the bowl ``top`` rests on the plate ``bottom``."""
     a, b = scene.model.body(f"{top}/").id, scene.model.body(f"{bottom}/").id
     offset = scene.xpos[:, a] - scene.xpos[:, b]
+    upright = scene.xmat[:, a].reshape(-1, 9)[:, 8]
     near = np.hypot(offset[:, 0], offset[:, 1]) < ON_DISTANCE
-    resting = np.abs(offset[:, 2] - (Plate.TOP - Bowl.BOTTOM)) < RESTING_GAP
-    return near & resting & (scene.xmat[:, a].reshape(-1, 9)[:, 8] > UPRIGHT)
+    lowest = offset[:, 2] - Bowl.FOOT_RADIUS * np.sqrt(np.clip(1 - upright**2, 0, None))
+    return near & (np.abs(lowest - Plate.TOP) < TOUCHING) & (upright > LEVEL)
 
 
 def open_(scene: SceneBatch, fixture: str, drawer: str) -> np.ndarray:

@@ -1,0 +1,107 @@
+"""The scripted expert solves its tasks, corrects disturbances and acts on each row alone."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from worldenv_trl.scenes import SceneBatch, ScriptedExpert, list_tasks, load_task
+
+NAMES = list_tasks("goal")
+
+
+def _scene(name: str, rows: int, split: str = "train", skip: int = 0) -> SceneBatch:
+    task = load_task(name)
+    scene = SceneBatch(task, rows, cameras=(), num_threads=1)
+    scene.reset(np.arange(rows), task.init_states(split, rows + skip)[skip:])
+    return scene
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+@pytest.mark.parametrize("name", NAMES)
+def test_the_expert_solves_every_initial_state_well_before_the_limit(name, split):
+    scene = _scene(name, 30, split)
+    expert, done = ScriptedExpert(scene.task), np.zeros(30, bool)
+    for _ in range(scene.task.max_steps - 10):
+        action = expert(scene)
+        assert action.shape == (30, 7) and np.abs(action).max() <= 1.0
+        scene.step(action)
+        done |= scene.success()
+    assert done.all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_success_lasts_when_the_hand_stops_at_once(name):
+    scene = _scene(name, 30)
+    expert, done = ScriptedExpert(scene.task), np.zeros(30, bool)
+    for _ in range(scene.task.max_steps):
+        action = expert(scene)
+        action[done] = 0.0
+        scene.step(action)
+        assert scene.success()[done].all()
+        done |= scene.success()
+    assert done.all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_small_noise_on_its_actions_is_corrected(name):
+    scene, rng = _scene(name, 30), np.random.default_rng(1)
+    expert, done = ScriptedExpert(scene.task), np.zeros(30, bool)
+    for _ in range(scene.task.max_steps):
+        noise = rng.normal(0.0, 0.05, (30, 7))
+        scene.step(np.clip(expert(scene) + noise, -1, 1))
+        done |= scene.success()
+    assert done.mean() > 0.9
+
+
+def test_a_dropped_bowl_is_taken_again():
+    scene = _scene(NAMES[0], 10)
+    expert, done = ScriptedExpert(scene.task), np.zeros(10, bool)
+    bowl = scene.model.body("bowl/").id
+    for step in range(90):
+        action = expert(scene)
+        if 26 <= step < 31:
+            action[:, 6] = -1.0
+        scene.step(action)
+        if step == 25:
+            assert scene.xpos[:, bowl, 2].min() > 0.05  # in the air
+        done |= scene.success()
+    assert done.all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_row_is_acted_on_as_if_it_were_alone(name):
+    many, alone = _scene(name, 4), _scene(name, 1, skip=2)
+    crowd, single = ScriptedExpert(many.task), ScriptedExpert(alone.task)
+    for _ in range(30):
+        action = crowd(many)
+        np.testing.assert_array_equal(single(alone)[0], action[2])
+        many.step(action)
+        alone.step(action[2:3])
+
+
+def test_a_reset_row_starts_again_and_leaves_the_others_alone():
+    scene = _scene(NAMES[0], 3)
+    task, start = scene.task, scene.sim_state()
+    expert = ScriptedExpert(task)
+    first = [expert(scene)]
+    for _ in range(29):
+        scene.step(first[-1])
+        first.append(expert(scene))
+    expert.reset(np.array([1]))
+    scene.step(first[-1])
+    scene.reset(np.array([1]), start[1:2])
+    for step in range(10):
+        action = expert(scene)
+        np.testing.assert_array_equal(action[1], first[step][1])
+        scene.step(action)
+    while not scene.success()[[0, 2]].all():
+        scene.step(expert(scene))
+
+
+def test_a_goal_without_a_script_is_refused_by_name():
+    task = dataclasses.replace(load_task(NAMES[0]), name="goal/stack", goal=(("Under", "bowl", "plate"),))
+    with pytest.raises(ValueError, match=r"no script for goal/stack.*On, Open, TurnOn"):
+        ScriptedExpert(task)

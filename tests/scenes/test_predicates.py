@@ -1,0 +1,142 @@
+"""Goal predicates against hand-placed states and against LIBERO's own formula on MuJoCo's contacts."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+
+from worldenv_trl.scenes import SceneBatch, ScriptedExpert, load_task, predicates
+from worldenv_trl.scenes.objects import Cabinet, Plate, Stove
+
+BOWL, DRAWER, STOVE = "goal/put_the_bowl_on_the_plate", "goal/open_the_top_drawer", "goal/turn_on_the_stove"
+
+
+def _scene(name: str, rows: int) -> SceneBatch:
+    scene = SceneBatch(load_task(name), rows, cameras=(), num_threads=1)
+    scene.reset(np.arange(rows), np.repeat(load_task(name).init_states("train", 1), rows, axis=0))
+    return scene
+
+
+def _current(scene: SceneBatch) -> SceneBatch:
+    scene.reset(np.arange(scene.num_envs), scene.sim_state())
+    return scene
+
+
+def _address(scene: SceneBatch, body: str) -> int:
+    return scene.model.jnt_qposadr[scene.model.body_jntadr[scene.model.body(body).id]]
+
+
+def _bowl_at(offsets, tilts=None) -> SceneBatch:
+    """The bowl's bottom placed at ``offsets [n, 3]`` from the middle of the plate's top, tilted about x (rad)."""
+    offsets = np.asarray(offsets, float)
+    scene = _scene(BOWL, len(offsets))
+    bowl, plate = _address(scene, "bowl/"), _address(scene, "plate/")
+    scene.qpos[:, bowl : bowl + 3] = scene.qpos[:, plate : plate + 3] + offsets + (0, 0, Plate.TOP)
+    half = np.zeros(len(offsets)) if tilts is None else np.asarray(tilts) / 2
+    scene.qpos[:, bowl + 3 : bowl + 7] = np.stack([np.cos(half), np.sin(half), 0 * half, 0 * half], -1)
+    return _current(scene)
+
+
+def test_a_bowl_is_on_the_plate_within_three_centimetres_of_its_middle():
+    distances = [0.0, 0.029, 0.031, 0.06]
+    scene = _bowl_at([(d * math.cos(0.7), d * math.sin(0.7), 0.0) for d in distances])
+    assert predicates.on(scene, "bowl", "plate").tolist() == [True, True, False, False]
+
+
+def test_a_bowl_held_above_the_plate_is_not_on_it():
+    scene = _bowl_at([(0, 0, 0.0), (0, 0, 0.002), (0, 0, 0.05)])
+    assert predicates.on(scene, "bowl", "plate").tolist() == [True, False, False]
+
+
+def test_a_bowl_on_its_side_or_upside_down_is_not_on_the_plate():
+    scene = _bowl_at(np.zeros((3, 3)), [0.0, 0.5, math.pi])
+    assert predicates.on(scene, "bowl", "plate").tolist() == [True, False, False]
+
+
+def test_a_bowl_held_askew_with_an_edge_on_the_plate_is_on_it_only_when_almost_level():
+    tilts = np.radians([2.0, 4.0, 6.0, 20.0])
+    edge = [(0, 0, 0.054 * math.sin(tilt)) for tilt in tilts]  # 0.054 m: radius of the foot
+    scene = _bowl_at(edge, tilts)
+    assert predicates.on(scene, "bowl", "plate").tolist() == [True, True, False, False]
+
+
+def test_a_bowl_on_the_table_beside_the_plate_is_not_on_it():
+    scene = _bowl_at([(0.0, 0.15, -Plate.TOP)])
+    assert not predicates.on(scene, "bowl", "plate").any()
+
+
+def _libero_on(scene: SceneBatch, lowered: float = 0.0) -> np.ndarray:
+    """LIBERO's On: the plate is not above the bowl, they touch, and their centres are within 3 cm horizontally.
+
+    The bowl is ``lowered`` (m) before the contact is looked for.
+    """
+    model, data = scene.model, mujoco.MjData(scene.model)
+    bodies = model.body("bowl/").id, model.body("plate/").id
+    result = []
+    for qpos in scene.qpos:
+        data.qpos[:] = qpos
+        data.qpos[_address(scene, "bowl/") + 2] -= lowered
+        mujoco.mj_forward(model, data)
+        pairs = {frozenset(model.geom_bodyid[contact.geom].tolist()) for contact in data.contact}
+        bowl, plate = data.xpos[bodies[0]], data.xpos[bodies[1]]
+        near = np.hypot(*(bowl - plate)[:2]) < 0.03
+        result.append(bool(frozenset(bodies) in pairs and near and plate[2] <= bowl[2]))
+    return np.array(result)
+
+
+def test_on_agrees_with_liberos_contact_test_for_bowls_dropped_around_the_plate():
+    rng = np.random.default_rng(3)
+    offsets = np.concatenate([rng.uniform(-0.035, 0.035, (40, 2)), np.full((40, 1), 0.004)], -1)
+    scene = _bowl_at(offsets)
+    for _ in range(20):
+        scene.step(np.zeros((40, 7)))
+    expected = _libero_on(scene)
+    assert 5 < expected.sum() < 35
+    assert np.array_equal(predicates.on(scene, "bowl", "plate"), expected)
+
+
+def test_on_is_true_in_an_experts_episode_only_where_liberos_is_true_to_a_millimetre():
+    task = load_task(BOWL)
+    scene = SceneBatch(task, 6, cameras=(), num_threads=1)
+    scene.reset(np.arange(6), task.init_states("train", 6))
+    expert, seen = ScriptedExpert(task), 0
+    for _ in range(55):
+        scene.step(expert(scene))
+        ours = predicates.on(scene, "bowl", "plate")
+        assert not (ours & ~_libero_on(scene, lowered=0.001)).any()
+        seen += int(ours.sum())
+    assert seen > 60
+
+
+def test_a_drawer_is_open_past_liberos_threshold_and_only_the_named_one_counts():
+    scene = _scene(DRAWER, 4)
+    for row, (drawer, travel) in enumerate([("top", -0.139), ("top", -0.141), ("middle", -0.15), ("bottom", -0.15)]):
+        scene.qpos[row, scene.model.jnt_qposadr[scene.model.joint(f"cabinet/{drawer}").id]] = travel
+    assert Cabinet.OPEN_BELOW == -0.14
+    assert predicates.open_(scene, "cabinet", "top").tolist() == [False, True, False, False]
+    assert predicates.open_(scene, "cabinet", "middle").tolist() == [False, False, True, False]
+    assert scene.success().tolist() == [False, True, False, False]
+
+
+def test_the_stove_is_on_once_its_lever_has_swung_sixty_degrees():
+    scene = _scene(STOVE, 3)
+    lever = scene.model.jnt_qposadr[scene.model.joint("stove/lever").id]
+    scene.qpos[:, lever] = [0.0, Stove.ON_ABOVE - 0.001, Stove.ON_ABOVE + 0.001]
+    assert math.degrees(Stove.ON_ABOVE) > 60
+    assert predicates.turn_on(scene, "stove").tolist() == [False, False, True]
+    assert scene.success().tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("name", [BOWL, DRAWER, STOVE])
+def test_success_is_judged_on_the_state_after_the_step(name):
+    task = load_task(name)
+    scene = SceneBatch(task, 3, cameras=(), num_threads=1)
+    scene.reset(np.arange(3), task.init_states("train", 3))
+    expert = ScriptedExpert(task)
+    while not scene.success().all():
+        scene.step(expert(scene))
+        stored = scene.success()
+        assert np.array_equal(_current(scene).success(), stored)

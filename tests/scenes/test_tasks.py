@@ -1,0 +1,133 @@
+"""The task catalogue: names, scenes, and initial states that are settled, reproducible and inside the picture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from worldenv_trl.scenes import SceneBatch, list_suites, list_tasks, load_task, tasks
+from worldenv_trl.scenes.objects import Stove
+
+NAMES = list_tasks("goal")
+
+
+def _scene(name: str, states: np.ndarray, **options) -> SceneBatch:
+    scene = SceneBatch(load_task(name), len(states), **({"cameras": (), "num_threads": 1} | options))
+    scene.reset(np.arange(len(states)), states)
+    return scene
+
+
+def test_the_goal_suite_lists_its_tasks_in_the_order_of_their_ids():
+    assert "goal" in list_suites()
+    assert NAMES == ["goal/put_the_bowl_on_the_plate", "goal/open_the_top_drawer", "goal/turn_on_the_stove"]
+    loaded = [load_task(name) for name in NAMES]
+    assert [task.task_id for task in loaded] == [0, 1, 2]
+    assert [task.name for task in loaded] == NAMES
+    assert all(task.suite == "goal" and task.max_steps == 64 and task.language for task in loaded)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: load_task("goal/turn_on_the_stve"), "did you mean 'goal/turn_on_the_stove'"),
+        (lambda: load_task("???"), "known tasks: goal/put_the_bowl_on_the_plate"),
+        (lambda: list_tasks("gaol"), "unknown suite 'gaol': it must be one of goal"),
+        (lambda: load_task(NAMES[0]).init_states("validation"), "'validation': it must be 'train' or 'test'"),
+        (lambda: load_task(NAMES[0]).init_states("train", 0), "count must be at least 1, got 0"),
+        (lambda: load_task(NAMES[0]).camera("sideview"), "unknown camera 'sideview'"),
+    ],
+)
+def test_a_wrong_name_or_number_is_named_with_the_remedy(call, message):
+    with pytest.raises(ValueError, match=message.replace("?", r"\?")):
+        call()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_longer_list_of_initial_states_extends_a_shorter_one(name):
+    task = load_task(name)
+    longer, shorter = task.init_states("train", 12), task.init_states("train", 5)
+    assert longer.dtype == np.float64
+    assert np.array_equal(longer[:5], shorter)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_initial_states_are_the_same_when_drawn_again_and_may_be_written_to(name):
+    task = load_task(name)
+    first = task.init_states("test", 4)
+    changed = task.init_states("test", 4)
+    changed[:] = 0.0
+    assert np.array_equal(task.init_states("test", 4), first)
+    tasks._init_states.cache_clear()
+    assert np.array_equal(task.init_states("test", 4), first)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_initial_state_is_in_both_splits_or_twice_in_one(name):
+    task = load_task(name)
+    states = np.concatenate([task.init_states("train", 40), task.init_states("test", 40)])
+    distance = np.abs(states[:, None] - states[None]).max(-1) + np.eye(80)
+    assert distance.min() > 1e-5
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_initial_states_are_unsolved_and_rest_while_nothing_is_done(name):
+    states = load_task(name).init_states("test", 20)
+    scene = _scene(name, states)
+    before = scene.xpos.copy()
+    assert not scene.success().any()
+    for _ in range(20):
+        scene.step(np.zeros((20, 7)))
+    assert np.abs(scene.xpos - before).max() < 1e-4
+    assert not scene.success().any()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_things_start_inside_their_rectangles_and_use_most_of_them(name):
+    task = load_task(name)
+    scene = _scene(name, task.init_states("train", 60))
+    for placement in task.placements:
+        place = scene.xpos[:, scene.model.body(f"{placement.name}/").id, :2]
+        away = np.abs(place - placement.center) / placement.half_size
+        assert away.max() <= 1.01
+        assert (np.ptp(place, axis=0) > 1.5 * np.array(placement.half_size)).all()
+
+
+def test_the_bowl_never_starts_against_the_plate():
+    scene = _scene(NAMES[0], load_task(NAMES[0]).init_states("test", 60))
+    bowl, plate = (scene.xpos[:, scene.model.body(f"{name}/").id, :2] for name in ("bowl", "plate"))
+    assert np.linalg.norm(bowl - plate, axis=-1).min() > 0.15
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_middle_of_everything_is_inside_the_picture(name):
+    task = load_task(name)
+    scene = _scene(name, task.init_states("test", 60))
+    for placement in task.placements:
+        place = scene.xpos[:, scene.model.body(f"{placement.name}/").id]
+        pixels = task.camera("agentview").project(place, 64)
+        assert pixels.min() > 8 and pixels.max() < 56
+
+
+def test_the_camera_spends_a_pixel_on_nine_millimetres_or_less_across_the_scene():
+    camera = load_task(NAMES[0]).camera("agentview")
+    left, right = camera.project(np.array([[0.0, -0.1, 0.05], [0.0, 0.1, 0.05]]), 64)
+    assert 200 / np.linalg.norm(right - left) < 9.0
+
+
+def test_the_model_is_compiled_once_and_holds_only_what_its_task_needs():
+    stove = load_task("goal/turn_on_the_stove")
+    assert stove.build() is stove.build()
+    names = {stove.build().body(index).name for index in range(stove.build().nbody)}
+    assert "stove/" in names and "bowl/" not in names and "cabinet/" not in names
+
+
+def test_the_burner_is_drawn_red_exactly_while_the_lever_is_on():
+    name = "goal/turn_on_the_stove"
+    states = np.repeat(load_task(name).init_states("train", 1), 3, axis=0)
+    scene = _scene(name, states, cameras=("agentview",))
+    lever = scene.model.jnt_qposadr[scene.model.joint("stove/lever").id]
+    scene.qpos[:, lever] = [0.0, Stove.ON_ABOVE - 0.01, Stove.ON_ABOVE + 0.01]
+    images = scene.render()["agentview"].astype(int)
+    red = (images[:, 0] > 180) & (images[:, 1] < 80) & (images[:, 2] < 80)
+    assert red[0].sum() == red[1].sum() == 0
+    assert red[2].sum() > 60  # px of 64 x 64
