@@ -40,7 +40,7 @@ class SFT:
 class Explore:
     """The policy's own rollouts in the scenes, at several multiples of its trained scale: data for both models."""
 
-    episodes_per_task: int = 320
+    episodes_per_task: int = 160
     scale_factors: tuple[float, ...] = (0.0, 1.0, 1.5, 2.5)
     """Multiples of the trained Laplace scale; the episodes are shared out equally. 0 is the greedy policy."""
     num_envs: int = 32
@@ -50,11 +50,11 @@ class Explore:
 class WorldModel:
     """Video world model training on demonstrations and exploration."""
 
-    steps: int = 4000
-    refit_steps: int = 1500
+    steps: int = 1700
+    refit_steps: int = 700
     """Steps of the later rounds, which continue from the model of the round before."""
-    batch_size: int = 16
-    lr: float = 6e-4
+    batch_size: int = 8
+    lr: float = 8e-4
     weight_decay: float = 1e-3
     unroll_prob: float = 0.5
     """Share of updates in which the second chunk is generated from the model's own first chunk."""
@@ -89,7 +89,7 @@ class PostTrain:
 
     env: str = "imagined"
     """``imagined`` (the world model) or ``tabletop`` (the physics: the upper bound; same recipe otherwise)."""
-    iterations: int = 20
+    iterations: int = 12
     groups: int = 24
     group_size: int = 8
     epochs: int = 4
@@ -98,7 +98,7 @@ class PostTrain:
     ratio_level: str = "step"
     lora_rank: int = 16
     lora_lr: float = 1e-4
-    head_lr: float = 3e-4
+    head_lr: float = 1e-4
     scale_factor: float = 1.5
     """Behaviour and scored density use this multiple of the trained scale."""
     warmup_iterations: int = 2
@@ -107,9 +107,9 @@ class PostTrain:
     max_grad_norm: float = 1.0
     standardize: bool = True
     """Divide the advantages of a batch by their overall standard deviation (World-Env does not)."""
-    probe_every: int = 5
+    probe_every: int = 3
     """Iterations between greedy probes on training contexts in the physics (logged, never learned from); 0 is never."""
-    probe_contexts: int = 50
+    probe_contexts: int = 16
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class WorldEnvConfig:
     tasks: tuple[str, ...] = GOAL_TASKS
     image_size: int = 64
     chunk_length: int = 8
-    max_steps: int = 64
+    max_steps: int = 56
     rounds: int = 1
     """Times that exploration, both models and LOOP run in turn, each with the policy reached so far."""
     demonstrate: Demonstrate = field(default_factory=Demonstrate)
