@@ -9,7 +9,10 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Classification:
-    """Figures of a binary classifier; 0 where nothing was predicted, or true, at all. ``auc`` is NaN with one class only."""
+    """Figures of a binary classifier; 0 where nothing was predicted, or true, at all.
+
+    ``auc`` is NaN with one class only.
+    """
 
     precision: float
     recall: float
@@ -43,7 +46,7 @@ def classification(probability: Tensor, label: Tensor, threshold: float = 0.5) -
 
 def _auc(probability: Tensor, label: Tensor) -> float:
     """Mann-Whitney's U: the share of (true, false) pairs that are ranked right, ties counted half."""
-    values, inverse, counts = probability.double().unique(return_inverse=True, return_counts=True)
+    _, inverse, counts = probability.double().unique(return_inverse=True, return_counts=True)
     ends = counts.cumsum(0).double()
     ranks = (ends - (counts.double() - 1) / 2)[inverse]
     positive = int(label.sum())

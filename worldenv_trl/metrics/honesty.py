@@ -21,9 +21,9 @@ def honesty(
         imagined_steps, real_steps: ``[n]``, env steps until success; compared where both succeed.
 
     Returns:
-        ``precision``, ``recall`` and ``f1`` of imagined success, ``gap`` of the success rates (imagined minus real) with a
-        95 % interval ``gap_low``, ``gap_high``, and with steps ``stop_error``, the mean absolute difference (NaN where
-        nothing succeeds in both).
+        ``precision``, ``recall`` and ``f1`` of imagined success, ``gap`` of the success rates (imagined minus real)
+        with a 95 % interval ``gap_low``, ``gap_high``, and with steps ``stop_error``, the mean absolute difference
+        (NaN where nothing succeeds in both).
 
     Raises:
         ValueError: if the two differ in length or are empty.

@@ -40,8 +40,9 @@ def paired_test(before: Tensor, after: Tensor) -> dict[str, float]:
         before, after: bool ``[n]``, success of the same initial states in the same order.
 
     Returns:
-        ``gained`` (failed before, succeed after), ``lost``, ``difference`` of the rates, its normal score ``z``, the exact
-        two-sided ``p_value`` (binomial on the discordant pairs), and ``low`` and ``high``, a 95 % interval of the difference.
+        ``gained`` (failed before, succeed after), ``lost``, ``difference`` of the rates, its normal score ``z``, the
+        exact two-sided ``p_value`` (binomial on the discordant pairs), and ``low`` and ``high``, a 95 % interval of
+        the difference.
 
     Raises:
         ValueError: if the two differ in length or are empty.
