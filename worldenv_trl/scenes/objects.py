@@ -38,8 +38,9 @@ class Bowl(_Primitive):
 
     def _shape(self, body: mjcf.Element) -> None:
         foot, staves = self.FOOT_RADIUS, 12
-        colour = {"rgba": (0.10, 0.10, 0.13, 1)}
-        body.add("geom", name="foot", type="cylinder", pos=(0, 0, 0.004), size=(foot, 0.004), mass=0.03, **colour)
+        # Green is nobody else's: a dark bowl runs into the dark hand that holds it.
+        outside, inside = {"rgba": (0.13, 0.62, 0.30, 1)}, {"rgba": (0.05, 0.22, 0.12, 1)}
+        body.add("geom", name="foot", type="cylinder", pos=(0, 0, 0.004), size=(foot, 0.004), mass=0.03, **inside)
         lean = math.atan2(self.RIM_RADIUS - foot, self.HEIGHT)
         length = math.hypot(self.RIM_RADIUS - foot, self.HEIGHT)
         radius = (self.RIM_RADIUS + foot) / 2
@@ -51,7 +52,7 @@ class Bowl(_Primitive):
             )
             body.add(
                 "geom", type="box", pos=(radius * math.cos(turn), radius * math.sin(turn), self.HEIGHT / 2),
-                quat=quat, size=(0.003, half_width, length / 2), mass=0.006, **colour,
+                quat=quat, size=(0.003, half_width, length / 2), mass=0.006, **outside,
             )  # fmt: skip
         body.add("site", name="center", pos=(0, 0, 0), size=(0.003,), rgba=(0, 0, 0, 0))
 
