@@ -50,7 +50,7 @@ class Explore:
 class WorldModel:
     """Video world model training on demonstrations and exploration."""
 
-    steps: int = 1700
+    steps: int = 1000
     refit_steps: int = 700
     """Steps of the later rounds, which continue from the model of the round before."""
     batch_size: int = 8
@@ -89,7 +89,7 @@ class PostTrain:
 
     env: str = "imagined"
     """``imagined`` (the world model) or ``tabletop`` (the physics: the upper bound; same recipe otherwise)."""
-    iterations: int = 12
+    iterations: int = 10
     groups: int = 24
     group_size: int = 8
     epochs: int = 4

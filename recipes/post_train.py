@@ -81,8 +81,9 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
             keys.MASK,
         )[wave[keys.MASK]]
         decisions[keys.STEP_MASK] = decisions["next", keys.STEP_MASK]
-        decisions = decisions[decisions[keys.ADVANTAGE].squeeze(-1) != 0]  # groups without variance teach nothing
-        metrics = _update(decisions, loss, optimizer, [lora, heads], settings)
+        total_steps = decisions[keys.STEP_MASK].sum()  # of Eq. 5: decisions that teach nothing count, too
+        decisions = decisions[decisions[keys.ADVANTAGE].squeeze(-1) != 0]
+        metrics = _update(decisions, total_steps, loss, optimizer, [lora, heads], settings)
         collector.update_policy_weights_()
 
         metrics |= _wave_metrics(wave, returns)
@@ -101,13 +102,16 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
     policy.save_pretrained(folder.checkpoint(target))
 
 
-def _update(decisions, loss, optimizer, parameter_groups, settings) -> dict[str, float]:
+def _update(decisions, total_steps, loss, optimizer, parameter_groups, settings) -> dict[str, float]:
     """K epochs of clipped updates on one batch of decisions, stopped when the policy has moved too far."""
     sums: dict[str, float] = {}
     count, stopped = 0, False
     for _ in range(settings.epochs):
         for rows in torch.randperm(len(decisions)).split(settings.minibatch_size):
-            out = loss(decisions[rows])
+            batch = decisions[rows]
+            # A minibatch stands for its share of the whole batch.
+            batch["total_steps"] = (total_steps * len(rows) / len(decisions)).expand(len(rows), 1)
+            out = loss(batch)
             if out["kl_approx"].item() > settings.max_kl:
                 stopped = True
                 break
