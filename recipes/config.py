@@ -50,15 +50,15 @@ class Explore:
 class WorldModel:
     """Video world model training on demonstrations and exploration."""
 
-    steps: int = 1000
+    steps: int = 2000
     refit_steps: int = 700
     """Steps of the later rounds, which continue from the model of the round before."""
     batch_size: int = 8
-    lr: float = 8e-4
+    lr: float = 1.5e-3
     weight_decay: float = 1e-3
     unroll_prob: float = 0.5
     """Share of updates in which the second chunk is generated from the model's own first chunk."""
-    frames_per_chunk: int | None = 4
+    frames_per_chunk: int | None = None
     """Frames of each chunk that are painted and scored in an update; all if None."""
     denoise_steps: int = 1
     deterministic: bool = True

@@ -18,11 +18,14 @@ from worldenv_trl.policies import laplace_actor
 from worldenv_trl.record import RolloutWriter
 
 
-def run(config: WorldEnvConfig, folder: RunFolder, before: str, after: str, models: str) -> None:
-    """Evaluates checkpoints ``before`` and ``after`` on the same held-out initial states."""
+def run(config: WorldEnvConfig, folder: RunFolder, before: str, after: str, models: str | None) -> None:
+    """Evaluates checkpoints ``before`` and ``after`` on the same held-out initial states.
+
+    Without ``models`` there is no reflector, and its protocol is left out.
+    """
     seed_everything(config, offset=90)
-    reflector = load_reflector(folder, models)
-    for protocol in ("physics", "reflector"):
+    reflector = None if models is None else load_reflector(folder, models)
+    for protocol in ("physics",) if reflector is None else ("physics", "reflector"):
         outcomes: dict[str, dict[str, torch.Tensor]] = {}
         for name in (before, after):
             actor = laplace_actor(load_policy(folder, name, "post_train"))

@@ -12,8 +12,10 @@ from config import WorldEnvConfig
 from parts import imagined_env, stopping_rule, tabletop
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
+from worldenv_trl.envs import chunked, context_id
 from worldenv_trl.record import RolloutWriter
 from worldenv_trl.reflectors import CompactReflector
+from worldenv_trl.scenes import load_task
 from worldenv_trl.world_models import VideoWorldModel
 
 
@@ -31,8 +33,8 @@ def physics_outcomes(
 ) -> torch.Tensor:
     """Success bool ``[episodes]`` of the first initial states of a split, in order.
 
-    The goal predicate ends an episode, or, with a ``reflector``, the reflector alone does: then success is whether the goal
-    holds in the moment it stops (or at the step limit).
+    The goal predicate ends an episode, or, with a ``reflector``, the reflector alone does: then success is whether the
+    goal holds in the moment it stops (or at the step limit).
     """
     num_envs = min(num_envs or config.evaluate.num_envs, episodes)
     env = tabletop(
@@ -48,7 +50,7 @@ def physics_outcomes(
         env = TransformedEnv(env, stopping_rule(reflector))
     waves = -(-episodes // num_envs)
     collector = GroupCollector(
-        chunked_env(env, config),
+        chunked(env, config.chunk_length),
         actor,
         groups_per_batch=num_envs,
         group_size=1,
@@ -67,12 +69,6 @@ def physics_outcomes(
             writer.write(rollouts)
     collector.shutdown()
     return torch.tensor([outcome[number] for number in sorted(outcome)][:episodes])
-
-
-def chunked_env(env, config: WorldEnvConfig):
-    from worldenv_trl.envs import chunked
-
-    return chunked(env, config.chunk_length)
 
 
 def imagined_outcomes(
@@ -103,20 +99,13 @@ def greedy_outcomes(
     per_task: int,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Greedy success of the first ``per_task`` training contexts of every task: ``(real, imagined)``, bool ``[K]``."""
-    chosen, real = [], []
-    for task in config.tasks:
-        outcome = physics_outcomes(config, actor, task, "train", per_task, num_envs=per_task)
-        real.append(outcome)
+    real = [physics_outcomes(config, actor, task, "train", per_task, num_envs=per_task) for task in config.tasks]
     numbers = contexts[keys.CONTEXT_ID].squeeze(-1)
-    from worldenv_trl.envs import context_id
-    from worldenv_trl.scenes import load_task
-
-    keep = []
+    chosen, kept = [], []
     for place, task in enumerate(config.tasks):
         for index in range(per_task):
             found = (numbers == context_id(load_task(task).task_id, "train", index)).nonzero()
             if len(found):
                 chosen.append(int(found[0, 0]))
-                keep.append(place * per_task + index)
-    imagined = imagined_outcomes(config, actor, world_model, reflector, contexts[chosen])
-    return torch.cat(real)[keep], imagined
+                kept.append(place * per_task + index)
+    return torch.cat(real)[kept], imagined_outcomes(config, actor, world_model, reflector, contexts[chosen])

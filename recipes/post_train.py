@@ -10,7 +10,7 @@ import torch
 from tqdm import tqdm
 
 from config import WorldEnvConfig
-from outcomes import greedy_outcomes
+from outcomes import greedy_outcomes, physics_outcomes
 from parts import (
     imagined_env,
     load_policy,
@@ -38,13 +38,12 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
         policy.add_lora(settings.lora_rank)
     actor = laplace_actor(policy, scale_factor=settings.scale_factor)
 
-    contexts = read_contexts(folder)
-    world_model, reflector = load_world_model(folder, models), load_reflector(folder, models)
     shape = [settings.groups, settings.group_size]
     if settings.env == "imagined":
-        env = imagined_env(config, world_model, reflector, contexts, shape)
+        imagination = load_world_model(folder, models), load_reflector(folder, models), read_contexts(folder)
+        env = imagined_env(config, *imagination, shape)
     else:
-        env = physics_waves_env(config, *shape)
+        imagination, env = None, physics_waves_env(config, *shape)
     collector = GroupCollector(
         env,
         actor,
@@ -88,7 +87,7 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
 
         metrics |= _wave_metrics(wave, returns)
         if settings.probe_every and (iteration % settings.probe_every == 0 or iteration == settings.iterations - 1):
-            metrics |= _probe(config, actor, world_model, reflector, contexts)
+            metrics |= _probe(config, actor, imagination)
         folder.log(target, step=iteration, **metrics)
         progress.set_postfix({k: f"{metrics[k]:.3f}" for k in ("return", "kl_approx", "real_success") if k in metrics})
         if iteration in (0, settings.iterations - 1):
@@ -144,9 +143,13 @@ def _wave_metrics(wave, returns) -> dict[str, float]:
     return metrics
 
 
-def _probe(config, actor, world_model, reflector, contexts) -> dict[str, float]:
-    """Greedy success on training contexts: in the physics (reflector not involved) and in imagination."""
-    real, imagined = greedy_outcomes(config, actor, world_model, reflector, contexts, config.post_train.probe_contexts)
+def _probe(config, actor, imagination) -> dict[str, float]:
+    """Greedy success on training contexts: in the physics (the reflector not involved) and in imagination."""
+    count = config.post_train.probe_contexts
+    if imagination is None:
+        real = [physics_outcomes(config, actor, task, "train", count, num_envs=count) for task in config.tasks]
+        return {"real_success": torch.cat(real).float().mean().item()}
+    real, imagined = greedy_outcomes(config, actor, *imagination, count)
     report = honesty(imagined.bool(), real.bool())
     return {
         "real_success": real.float().mean().item(),

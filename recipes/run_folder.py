@@ -77,16 +77,14 @@ class RunFolder:
         stored = self.path / "config.yaml"
         if stored.exists():
             old = yaml.safe_load(stored.read_text())
-            changed = [
-                key
-                for key in _flat(new)
-                if _flat(old).get(key) != _flat(new)[key] and key not in {"run_dir", "num_threads"}
-            ]
+            before, now = _flat(old), _flat(new)
+            free = {"run_dir", "num_threads"}
+            changed = [key for key in now if before.get(key) != now[key] and key not in free]
             if changed:
-                key = changed[0]
+                key, more = changed[0], f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
                 raise ValueError(
-                    f"{self.path} was made with {key}={_flat(old).get(key)!r}, now {_flat(new)[key]!r}"
-                    f"{f' (and {len(changed) - 1} more)' if len(changed) > 1 else ''}: use another --run-dir, or the same settings to continue"
+                    f"{self.path} was made with {key}={before.get(key)!r}, now {now[key]!r}{more}: "
+                    "use another --run-dir, or the same settings to continue"
                 )
         for name in ("checkpoints", "rollouts", "plots", "stages"):
             (self.path / name).mkdir(exist_ok=True)

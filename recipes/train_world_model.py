@@ -23,7 +23,7 @@ from worldenv_trl.objectives import DiffusionLoss
 from worldenv_trl.scenes import load_task
 from worldenv_trl.world_models import VideoWorldModel, VideoWorldModelConfig
 
-HORIZONS = (1, 20, 60)
+HORIZONS = (1, 20, 40, 56, 60)
 
 
 def run(
@@ -35,7 +35,7 @@ def run(
     demonstrations, explored = read_episodes(folder, rounds)
     training, held_out = split_by_context(explored, settings.holdout, config.seed)
     training = concatenate_episodes([demonstrations, training])
-    model = _new_model(config) if previous is None else load_world_model(folder, previous.removeprefix("world_model"))
+    model = new_model(config) if previous is None else load_world_model(folder, previous.removeprefix("world_model"))
     model.train()
     sampler = WindowSampler(training, ForwardKinematics(), model, seed=config.seed + rounds)
     loss = DiffusionLoss(model, unroll_prob=settings.unroll_prob, frames_per_chunk=settings.frames_per_chunk)
@@ -60,7 +60,8 @@ def run(
     folder.log(target, episodes=len(training), held_out=len(held_out), **fidelity(model, held_out))
 
 
-def _new_model(config: WorldEnvConfig) -> VideoWorldModel:
+def new_model(config: WorldEnvConfig) -> VideoWorldModel:
+    """An untrained model for the cameras of the tasks."""
     cameras = {task.task_id: task.camera("agentview") for task in map(load_task, config.tasks)}
     return VideoWorldModel(
         VideoWorldModelConfig.for_cameras(
@@ -74,7 +75,7 @@ def _new_model(config: WorldEnvConfig) -> VideoWorldModel:
 
 
 def fidelity(model: VideoWorldModel, episodes: TensorDict) -> dict[str, float]:
-    """PSNR of open-loop imagination at 1, 20 and 60 frames, on all and on moving pixels, beside copying the first frame."""
+    """PSNR of open-loop imagination at some horizons, on all and on moving pixels, beside copying the first frame."""
     imagined = imagine_episodes(model, episodes, ForwardKinematics())["frames"]  # [R, T+1, 3, H, W]
     figures: dict[str, float] = {}
     for horizon in (horizon for horizon in HORIZONS if horizon < imagined.shape[1]):

@@ -43,6 +43,12 @@ def stages(config: WorldEnvConfig) -> list[Stage]:
     """World-Env's Algorithm 1 as a list; a later round continues from the policy that the round before reached."""
     plan = [Stage("demonstrate", "demonstrate", demonstrate.run), Stage("sft", "sft", sft.run)]
     policy, previous = "sft", None
+    if config.post_train.env == "tabletop":  # the upper bound needs neither world model nor reflector
+        plan.append(
+            Stage("post_train", "post_train", partial(post_train.run, source="sft", target="post_train", models=""))
+        )
+        evaluation = partial(evaluate.run, before="sft", after="post_train", models=None)
+        return [*plan, Stage("evaluate", "evaluate", evaluation)]
     for number in range(1, config.rounds + 1):
         suffix = "" if number == 1 else f"_{number}"
         improved = f"post_train{suffix}"

@@ -1,0 +1,171 @@
+"""Speeds of every part on this machine: ``python recipes/benchmarks/throughput.py [--num-threads 2]``.
+
+Prints one line a figure: median of repeated measurements and their range. Nothing is learned and nothing is kept.
+"""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the recipes beside this folder
+
+import torch
+import tyro
+from tensordict import TensorDict
+from torchrl.objectives import BCLoss
+
+from config import WorldEnvConfig
+from parts import imagined_env, physics_waves_env, tabletop, task_instructions
+from train_world_model import new_model
+from worldenv_trl import keys
+from worldenv_trl.collectors import GroupCollector
+from worldenv_trl.data import WindowSampler, episodes_from_rollouts, policy_samples
+from worldenv_trl.envs import ExpertPolicy
+from worldenv_trl.kinematics import ForwardKinematics
+from worldenv_trl.objectives import DiffusionLoss, LOOPLoss
+from worldenv_trl.policies import OFTConfig, OFTPolicy, laplace_actor
+from worldenv_trl.record import RolloutWriter, read_rollouts
+from worldenv_trl.reflectors import CompactReflector, CompactReflectorConfig
+from worldenv_trl.world_models import VideoWorldModel
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What is measured, and how often."""
+
+    num_threads: int = 2
+    repeats: int = 3
+    rows: tuple[int, ...] = (1, 16, 64)
+    """Batch sizes of TabletopEnv."""
+
+
+class _Timed(torch.nn.Module):
+    """A module that adds up the seconds spent inside it."""
+
+    def __init__(self, module: VideoWorldModel) -> None:
+        super().__init__()
+        self.module, self.seconds = module, 0.0
+
+    def forward(self, tensordict: TensorDict) -> TensorDict:
+        started = time.perf_counter()
+        out = self.module(tensordict)
+        self.seconds += time.perf_counter() - started
+        return out
+
+    def memory_indices(self, t: torch.Tensor) -> torch.Tensor:
+        return self.module.memory_indices(t)
+
+
+def report(name: str, unit: str, values: list[float]) -> None:
+    print(f"{name:<52} {statistics.median(values):>9.1f} {unit}   [{min(values):.1f}, {max(values):.1f}]", flush=True)
+
+
+def rate(work: Callable[[], float], repeats: int) -> list[float]:
+    """Units per second of ``work``, which returns how many it did; once more before, uncounted."""
+    work()
+    rates = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        done = work()
+        rates.append(done / (time.perf_counter() - started))
+    return rates
+
+
+def main(settings: Benchmark) -> None:
+    torch.set_num_threads(settings.num_threads)
+    torch.manual_seed(0)
+    config = WorldEnvConfig(num_threads=settings.num_threads)
+    print(f"{settings.num_threads} threads, median of {settings.repeats} [range]")
+
+    for rows in settings.rows:
+        env = tabletop(config, "train", rows, config.tasks[:1], terminate_on_success=False)
+        steps = max(20, 640 // rows)
+        speeds = rate(
+            lambda env=env, n=steps, r=rows: r * env.rollout(n, break_when_any_done=False).shape[1], settings.repeats
+        )
+        report(f"TabletopEnv, 64 px, 1 camera, {rows} rows", "env-steps/s", speeds)
+        env.close()
+
+    env = tabletop(config, "train", 15, None, init_state_mode="cycle")
+    demonstrations = next(iter(GroupCollector(env, ExpertPolicy(env), groups_per_batch=15)))[:, 0]
+    env.close()
+    episodes = episodes_from_rollouts(demonstrations)
+    policy = OFTPolicy(OFTConfig.for_tasks(task_instructions(config)))
+    actor = laplace_actor(policy)
+    model, kinematics = new_model(config), ForwardKinematics()
+    reflector = CompactReflector(CompactReflectorConfig(num_tasks=3, threshold=0.99))
+    contexts = demonstrations[:, 0]
+
+    timed = _Timed(model.eval())
+    env = imagined_env(config, timed, reflector, contexts, [8, 8])
+    collector = GroupCollector(env, actor, groups_per_batch=8)
+    total, shares = [], []
+    for index in range(settings.repeats + 1):
+        timed.seconds, started = 0.0, time.perf_counter()
+        wave = collector.next()
+        seconds = time.perf_counter() - started
+        if index:  # the first is a warm-up
+            total.append((wave["next", keys.STEP_MASK] & wave[keys.MASK][..., None]).sum().item() / seconds)
+            shares.append(100 * (1 - timed.seconds / seconds))
+    report("imagined rollouts (policy, reflector), 64 rows", "frames/s", total)
+    report("  of that time outside the world model", "%", shares)
+
+    def train(loss: Callable[[], torch.Tensor], count: int) -> float:
+        for _ in range(count):
+            loss().backward()
+        return count
+
+    samples = policy_samples(episodes)
+    cloning = BCLoss(actor, loss_function="l1")
+    cloning.set_keys(action=keys.CHUNK, pad_mask=keys.ACTION_IS_PAD)
+    draw = lambda n: samples[torch.randint(len(samples), (n,))]  # noqa: E731
+    report("SFT, batch 64", "steps/s", rate(lambda: train(lambda: cloning(draw(64))["loss_bc"], 5), settings.repeats))
+    sampler = WindowSampler(episodes, kinematics, model.train())
+    loss = DiffusionLoss(model, frames_per_chunk=config.world_model.frames_per_chunk)
+    batch = config.world_model.batch_size
+    speeds = rate(lambda: train(lambda: loss(sampler.sample(batch))["loss_diffusion"], 3), settings.repeats)
+    report(f"world model, batch {batch}", "steps/s", speeds)
+    policy.add_lora(config.post_train.lora_rank)
+    objective = LOOPLoss(actor, functional=False)
+    decisions = wave[wave[keys.MASK]]
+    decisions[keys.ADVANTAGE] = torch.randn(len(decisions), 1)
+    picked = lambda: decisions[torch.randint(len(decisions), (256,))]  # noqa: E731
+    report(
+        "LOOP, minibatch 256",
+        "steps/s",
+        rate(lambda: train(lambda: objective(picked())["loss_objective"], 2), settings.repeats),
+    )
+
+    with tempfile.TemporaryDirectory() as folder:
+        count = iter(range(100))
+
+        def write() -> float:
+            with RolloutWriter(Path(folder) / f"{next(count)}.mcap") as writer:
+                writer.write(demonstrations)
+            return float(demonstrations[keys.MASK].sum())
+
+        report("MCAP, written", "env-steps/s", rate(write, settings.repeats))
+        path = Path(folder) / "0.mcap"
+        report("MCAP, read", "env-steps/s", rate(lambda: float(read_rollouts(path)[keys.MASK].sum()), settings.repeats))
+        print(f"{'MCAP, size':<52} {path.stat().st_size / float(demonstrations[keys.MASK].sum()):>9.1f} B/env-step")
+
+    env = physics_waves_env(config, 3, 8)
+    waves = GroupCollector(env, actor, groups_per_batch=3, group_size=8)
+    report(
+        "physics waves (policy), 24 rows",
+        "env-steps/s",
+        rate(lambda: float(waves.next()["next", keys.STEP_MASK].sum()), 1),
+    )
+    waves.shutdown()
+    print(f"{'peak memory':<52} {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:>9.0f} MB")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Benchmark, description=__doc__))
