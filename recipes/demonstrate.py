@@ -5,6 +5,7 @@ Alone: ``python recipes/demonstrate.py improve --run-dir runs/improve``.
 
 from __future__ import annotations
 
+import torch
 from tqdm import tqdm
 
 from config import WorldEnvConfig
@@ -35,12 +36,16 @@ def run(config: WorldEnvConfig, folder: RunFolder) -> None:
             rollouts = next(iter(collector))[:, 0]
             collector.shutdown()
             solved = (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1)
-            if not solved.all():
-                raise RuntimeError(f"the expert solved {int(solved.sum())} of {count} demonstrations of {task}")
+            check_solved(task, solved)
             writer.write(rollouts)
             folder.log(
                 "demonstrate", task=task, episodes=count, steps=rollouts[keys.MASK].sum(-1).float().mean().item()
             )
+
+
+def check_solved(task: str, solved: torch.Tensor) -> None:
+    if not solved.all():
+        raise RuntimeError(f"the expert solved {int(solved.sum())} of {len(solved)} demonstrations of {task}")
 
 
 if __name__ == "__main__":

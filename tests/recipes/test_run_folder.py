@@ -1,0 +1,67 @@
+"""Run folders: resuming, and what happens when something goes wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+
+import pytest
+
+from config import PRESETS, SFT
+from run_folder import RunFolder
+
+
+@pytest.fixture
+def config(tmp_path):
+    return dataclasses.replace(PRESETS["smoke"][1], run_dir=tmp_path / "run")
+
+
+@pytest.fixture
+def folder(config):
+    folder = RunFolder(config.run_dir)
+    folder.open(config)
+    return folder
+
+
+def test_a_stage_that_raises_is_not_finished_and_its_metrics_go_when_it_runs_again(folder):
+    folder.log("explore", success=0.5)
+    with pytest.raises(KeyboardInterrupt), folder.stage("sft"):
+        folder.log("sft", step=0, l1=1.0)
+        raise KeyboardInterrupt
+    assert not folder.done("sft")
+    with folder.stage("sft"):
+        folder.log("sft", step=0, l1=2.0)
+    assert folder.done("sft")
+    assert [item["l1"] for item in folder.read_metrics("sft") if "l1" in item] == [2.0]
+    assert folder.read_metrics("explore") == [{"stage": "explore", "success": 0.5}]
+
+
+def test_the_same_settings_continue_a_run_and_others_are_refused_by_name(config, folder):
+    folder.open(config)
+    folder.open(dataclasses.replace(config, num_threads=1))  # where it runs is no setting of the result
+    with pytest.raises(ValueError, match=r"sft.steps=250, now 7: use another --run-dir"):
+        folder.open(dataclasses.replace(config, sft=dataclasses.replace(config.sft, steps=7)))
+    assert SFT().steps != 7
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("precious")
+    with pytest.raises(NotADirectoryError, match="choose another --run-dir"):
+        RunFolder(path)
+    assert path.read_text() == "precious"
+
+
+def test_too_little_disk_is_refused_before_anything_is_written(config, monkeypatch):
+    usage = shutil.disk_usage("/")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=10_000_000))
+    with pytest.raises(OSError, match=r"0\.01 GB free"):
+        RunFolder(config.run_dir).open(config)
+    assert not (config.run_dir / "config.yaml").exists()
+
+
+def test_missing_inputs_name_the_stage_that_makes_them(folder):
+    with pytest.raises(FileNotFoundError, match="run the stage 'sft'"):
+        folder.require_checkpoint("sft", "sft")
+    with pytest.raises(FileNotFoundError, match="run the stage 'explore'"):
+        folder.require_rollouts("explore", "explore")

@@ -1,0 +1,84 @@
+"""The command line and the whole loop, at the smallest scale."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from config import GOAL_TASKS, PRESETS, Demonstrate, Evaluate, Explore, PostTrain, Reflector, WorldModel
+from config import SFT as SFTConfig
+from parts import check_config
+from run_folder import RunFolder
+from world_env import parse, run_all, stages
+from worldenv_trl import keys
+from worldenv_trl.record import read_rollouts
+
+
+@pytest.fixture
+def tiny(tmp_path):
+    return dataclasses.replace(
+        PRESETS["smoke"][1],
+        run_dir=tmp_path / "run",
+        num_threads=1,
+        tasks=GOAL_TASKS[1:2],
+        max_steps=16,
+        demonstrate=Demonstrate(episodes_per_task=1),
+        sft=SFTConfig(steps=3, scale_steps=2),
+        explore=Explore(episodes_per_task=8, num_envs=4, scale_factors=(1.0,)),
+        world_model=WorldModel(steps=2, batch_size=2),
+        reflector=Reflector(encoder_steps=2, steps=2, batch_size=4),
+        post_train=PostTrain(iterations=1, groups=2, group_size=2, epochs=1, probe_contexts=2),
+        evaluate=Evaluate(episodes_per_task=2, num_envs=2),
+    )
+
+
+def test_presets_parse_and_single_settings_are_overridden():
+    config = parse(["smoke", "--seed", "3", "--post-train.clip-epsilon", "0.2"])
+    assert (config.seed, config.post_train.clip_epsilon, config.explore) == (3, 0.2, PRESETS["smoke"][1].explore)
+
+
+def test_later_rounds_start_from_the_policy_of_the_round_before():
+    names = [stage.name for stage in stages(dataclasses.replace(PRESETS["smoke"][1], rounds=2))]
+    assert names.index("post_train") < names.index("explore_2") < names.index("post_train_2") < names.index("evaluate")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"tasks": ("goal/open_the_top_drawr",)}, "did you mean 'goal/open_the_top_drawer'"),
+        ({"tasks": ()}, "name at least one task"),
+        ({"max_steps": 20}, "multiple of chunk_length=8, got 20"),
+        ({"post_train": PostTrain(env="robot")}, "'robot'"),
+        ({"image_size": 8}, "image_size"),
+    ],
+)
+def test_bad_settings_fail_before_any_work_starts(change, message):
+    with pytest.raises(ValueError, match=message):
+        check_config(dataclasses.replace(PRESETS["smoke"][1], **change))
+
+
+def test_the_whole_loop_runs_writes_its_files_and_continues_where_it_stopped(tiny, capsys, monkeypatch):
+    monkeypatch.setattr("demonstrate.check_solved", lambda *_: None)  # 16 steps are too few for the expert
+    threads = torch.get_num_threads()
+    run_all(tiny)
+    folder = RunFolder(tiny.run_dir)
+    assert all(folder.done(stage.name) for stage in stages(tiny))
+    assert {path.name for path in (tiny.run_dir / "checkpoints").iterdir()} >= {
+        "sft",
+        "world_model",
+        "reflector",
+        "post_train",
+    }
+    assert all((tiny.run_dir / "plots" / f"{name}.png").exists() for name in ("losses", "evaluation"))
+    wave = read_rollouts(folder.rollouts("post_train_000"))
+    assert wave[keys.CHUNK].shape[-2:] == (8, 7)
+    assert "physics" in capsys.readouterr().out
+
+    (tiny.run_dir / "stages" / "evaluate").unlink()
+    before = folder.checkpoint("post_train").joinpath("model.safetensors").stat().st_mtime_ns
+    run_all(tiny)
+    assert "post_train: finished, skipped" in capsys.readouterr().out
+    assert folder.checkpoint("post_train").joinpath("model.safetensors").stat().st_mtime_ns == before
+    torch.set_num_threads(threads)
