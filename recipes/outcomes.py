@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDict
 from torchrl.envs.transforms import TransformedEnv
@@ -18,6 +20,8 @@ from worldenv_trl.reflectors import CompactReflector
 from worldenv_trl.scenes import load_task
 from worldenv_trl.world_models import VideoWorldModel
 
+TRAIN_CONTEXTS = 50  # the standard protocol's training initial states
+
 
 def physics_outcomes(
     config: WorldEnvConfig,
@@ -26,24 +30,31 @@ def physics_outcomes(
     split: str,
     episodes: int,
     *,
-    num_envs: int | None = None,
+    indices: Sequence[int] | None = None,
     reflector: CompactReflector | None = None,
     writer: RolloutWriter | None = None,
     label: str = "",
 ) -> torch.Tensor:
-    """Success bool ``[episodes]`` of the first initial states of a split, in order.
+    """Success bool ``[episodes]`` of the first initial states of a split, or of those at ``indices``, in order.
 
     The goal predicate ends an episode, or, with a ``reflector``, the reflector alone does: then success is whether the
     goal holds in the moment it stops (or at the step limit).
     """
-    num_envs = min(num_envs or config.evaluate.num_envs, episodes)
+    options = {"init_state_count": episodes}
+    if indices is not None:  # these initial states of the split only
+        task_id, episodes = load_task(task).task_id, len(indices)
+        options = {
+            "init_states": load_task(task).init_states(split, max(indices) + 1)[list(indices)],
+            "context_ids": [context_id(task_id, split, index) for index in indices],
+        }
+    num_envs = min(config.evaluate.num_envs, episodes)
     env = tabletop(
         config,
         split,
         num_envs,
         [task],
         init_state_mode="cycle",
-        init_state_count=episodes,
+        **options,
         terminate_on_success=reflector is None,
     )
     if reflector is not None:
@@ -98,14 +109,16 @@ def greedy_outcomes(
     contexts: TensorDict,
     per_task: int,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Greedy success of the first ``per_task`` training contexts of every task: ``(real, imagined)``, bool ``[K]``."""
-    real = [physics_outcomes(config, actor, task, "train", per_task, num_envs=per_task) for task in config.tasks]
+    """Greedy success on up to ``per_task`` training contexts of every task: ``(real, imagined)``, bool ``[K]``."""
     numbers = contexts[keys.CONTEXT_ID].squeeze(-1)
-    chosen, kept = [], []
-    for place, task in enumerate(config.tasks):
-        for index in range(per_task):
-            found = (numbers == context_id(load_task(task).task_id, "train", index)).nonzero()
-            if len(found):
-                chosen.append(int(found[0, 0]))
-                kept.append(place * per_task + index)
-    return torch.cat(real)[kept], imagined_outcomes(config, actor, world_model, reflector, contexts[chosen])
+    chosen, real = [], []
+    for task in config.tasks:
+        first = context_id(load_task(task).task_id, "train", 0)
+        rows = ((numbers >= first) & (numbers < first + TRAIN_CONTEXTS)).nonzero().squeeze(-1)[:per_task]
+        if len(rows):
+            indices = (numbers[rows] - first).tolist()
+            outcome = physics_outcomes(config, actor, task, "train", TRAIN_CONTEXTS, indices=indices)
+            chosen.append(rows)
+            real.append(outcome)
+    chosen = torch.cat(chosen)
+    return torch.cat(real), imagined_outcomes(config, actor, world_model, reflector, contexts[chosen])
