@@ -99,7 +99,7 @@ class PostTrain:
     lora_rank: int = 16
     lora_lr: float = 1e-4
     head_lr: float = 1e-4
-    scale_factor: float = 1.5
+    scale_factor: float = 2.0
     """Behaviour and scored density use this multiple of the trained scale."""
     warmup_iterations: int = 2
     max_kl: float = 0.1

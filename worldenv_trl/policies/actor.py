@@ -52,7 +52,7 @@ def laplace_actor(
     *,
     event_dims: int = 1,
     scale_factor: float = 1.0,
-    log_scale_bounds: tuple[float, float] | None = (-4.0, -1.5),
+    log_scale_bounds: tuple[float, float] | None = (-6.0, -1.5),
     loc_key: NestedKey = LOC,
     scale_key: NestedKey = SCALE,
 ) -> LaplaceActor:
