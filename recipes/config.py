@@ -97,12 +97,12 @@ class PostTrain:
     clip_epsilon: float = 0.1
     ratio_level: str = "step"
     lora_rank: int = 16
-    lora_lr: float = 1e-4
-    head_lr: float = 1e-4
+    lora_lr: float = 3e-5
+    head_lr: float = 3e-5
     scale_factor: float = 2.0
     """Behaviour and scored density use this multiple of the trained scale."""
     warmup_iterations: int = 2
-    max_kl: float = 0.1
+    max_kl: float = 0.3
     """An iteration's updates stop when the approximate KL per step exceeds this."""
     max_grad_norm: float = 1.0
     standardize: bool = True
@@ -149,7 +149,7 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
             run_dir=Path("runs/smoke"),
             sft=SFT(steps=250, scale_steps=40),
             explore=Explore(episodes_per_task=24, num_envs=24),
-            world_model=WorldModel(steps=220),
+            world_model=WorldModel(steps=100),
             reflector=Reflector(encoder_steps=60, steps=80),
             post_train=PostTrain(iterations=2, groups=6, probe_every=1, probe_contexts=10),
             evaluate=Evaluate(episodes_per_task=20, num_envs=20),

@@ -151,6 +151,7 @@ class TabletopEnv(EnvBase):
         self._make_buffers(max_steps)
         self._make_specs()
         self._set_seed(seed)
+        self.is_closed = False
 
     # ------------------------------------------------------------------------------------------------- set-up
 
