@@ -28,9 +28,9 @@ __all__ = ["Reflect"]
 class Reflect(Transform):
     """Scores every prefix of a rollout's video and ends the rollout at once when it says that the task is done.
 
-    Over :class:`ImaginedEnv` all frames of a chunk are scored in one batch; the first crossing ends the row *inside* the
-    chunk: ``step_mask`` is False behind it, and image, states and ``num_steps`` are those of the crossing frame. Over a
-    step-level :class:`TabletopEnv` each frame is scored as it comes (put :func:`chunked` around it, not inside).
+    Over :class:`ImaginedEnv` all frames of a chunk are scored in one batch; the first crossing ends the row *inside*
+    the chunk: ``step_mask`` is False behind it, and image, states and ``num_steps`` are those of the crossing frame.
+    Over a step-level :class:`TabletopEnv` each frame is scored as it comes (put :func:`chunked` around it, not inside).
 
     ``reward`` is 0 until the rollout ends, for whatever reason, and then R(o_1:t, g) (World-Env section 3.3);
     ``success_prob`` is the score of the last frame. The first frame, seen before anything was done, never stops a row.

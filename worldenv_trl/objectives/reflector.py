@@ -21,8 +21,8 @@ __all__ = ["ReflectorLoss"]
 class ReflectorLoss(LossModule):
     """BCE of R(o_1:t, g) against whether the goal holds at frame t.
 
-    Reads ``features`` [P, L, F] of sampled prefixes, ``lengths`` int64 [P, 1], ``task_id`` [P, 1] and ``label`` bool [P, 1].
-    Returns ``loss_reflector`` (scalar) and the detached ``accuracy`` at 0.5.
+    Reads ``features`` [P, L, F] of sampled prefixes, ``lengths`` int64 [P, 1], ``task_id`` [P, 1] and ``label`` bool
+    [P, 1]. Returns ``loss_reflector`` (scalar) and the detached ``accuracy`` at 0.5.
 
     Args:
         reflector: its reward head is trained in place; the encoder is not touched.

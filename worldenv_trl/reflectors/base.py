@@ -18,7 +18,7 @@ def prefix_indices(lengths: Tensor, num_frames: int) -> Tensor:
         num_frames: most frames looked at.
 
     Returns:
-        int64 ``[P, L]`` with ``L = min(num_frames, max(lengths))``; prefixes shorter than ``L`` repeat their last frame.
+        int64 ``[P, L]`` with ``L = min(num_frames, max(lengths))``; shorter prefixes repeat their last frame.
     """
     count = int(min(num_frames, int(lengths.max())))
     slots = torch.arange(count, device=lengths.device)
@@ -30,8 +30,8 @@ def prefix_indices(lengths: Tensor, num_frames: int) -> Tensor:
 class Reflector(nn.Module, abc.ABC):
     """Frozen encoder and reward head.
 
-    Subclasses encode frames one by one and score prefixes of the features; :meth:`prefix_scores` gives the scores of all
-    prefixes of a chunk in one batch.
+    Subclasses encode frames one by one and score prefixes of the features; :meth:`prefix_scores` gives the scores of
+    all prefixes of a chunk in one batch.
     """
 
     num_frames: int = 32

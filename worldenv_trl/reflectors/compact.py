@@ -52,8 +52,8 @@ class CompactReflectorConfig:
 class CompactReflector(Reflector, Pretrained):
     """R(o_1:t, g) from features of up to 32 frames.
 
-    The encoder learns to tell success frame by frame (:meth:`frame_logits`) and is then frozen; the reward head, which sees
-    the prefix, is trained on its features.
+    The encoder learns to tell success frame by frame (:meth:`frame_logits`) and is then frozen; the reward head, which
+    sees the prefix, is trained on its features.
 
     Args:
         config: sizes.
