@@ -100,8 +100,9 @@ class ForwardKinematics(nn.Module):
             [target - pose[:, :3, 3], _log(target_rotation @ pose[:, :3, :3].transpose(-1, -2))], -1
         )  # [n, 6]
         transposed = jacobian.transpose(-1, -2)
-        step = transposed @ torch.linalg.solve(jacobian @ transposed + self._damping, error.unsqueeze(-1))
-        q = (q + step.squeeze(-1)).clamp(self._joint_low, self._joint_high)
+        step = (transposed @ torch.linalg.solve(jacobian @ transposed + self._damping, error.unsqueeze(-1))).squeeze(-1)
+        step = step * (panda.MAX_JOINT_STEP / step.abs().amax(-1, keepdim=True).clamp(min=1e-12)).clamp(max=1.0)
+        q = (q + step).clamp(self._joint_low, self._joint_high)
         return torch.cat([q, target, target_rotation.flatten(1), opening], -1)
 
     def pose(self, kinematic_state: Tensor) -> Tensor:

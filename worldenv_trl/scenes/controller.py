@@ -132,4 +132,5 @@ def joint_targets(q: np.ndarray, targets: np.ndarray) -> np.ndarray:
     error = np.concatenate([targets[:, :3] - position, vector_from_rotation(desired @ rotation.swapaxes(1, 2))], -1)
     damped = jacobian @ jacobian.swapaxes(1, 2) + panda.DLS_DAMPING**2 * np.eye(6)
     step = (jacobian.swapaxes(1, 2) @ np.linalg.solve(damped, error[..., None]))[..., 0]
+    step *= np.minimum(1.0, panda.MAX_JOINT_STEP / np.maximum(np.abs(step).max(-1, keepdims=True), 1e-12))
     return np.clip(q + step, panda.JOINT_LOW, panda.JOINT_HIGH)

@@ -62,6 +62,7 @@ WORKSPACE_HIGH = np.array([0.30, 0.35, 0.45])
 FINGER_TRAVEL = 0.04  # each finger; the opening 1 is 0.08 m wide
 GRIPPER_RATE = 0.2  # change of the commanded opening per control step
 DLS_DAMPING = 0.02
+MAX_JOINT_STEP = 0.2  # rad per control step; without it a target out of reach makes the arm swing
 TIMESTEP = 0.005
 SUBSTEPS = 10  # 20 Hz control
 
