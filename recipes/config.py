@@ -147,9 +147,9 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
         "Every stage for real in at most 6 minutes on 2 cores; too short to improve anything.",
         WorldEnvConfig(
             run_dir=Path("runs/smoke"),
-            sft=SFT(steps=250, scale_steps=40),
+            sft=SFT(steps=800, scale_steps=60),
             explore=Explore(episodes_per_task=24, num_envs=24),
-            world_model=WorldModel(steps=100),
+            world_model=WorldModel(steps=160),
             reflector=Reflector(encoder_steps=60, steps=80),
             post_train=PostTrain(iterations=2, groups=6, probe_every=1, probe_contexts=10),
             evaluate=Evaluate(episodes_per_task=20, num_envs=20),

@@ -39,7 +39,7 @@ def test_a_stage_that_raises_is_not_finished_and_its_metrics_go_when_it_runs_aga
 def test_the_same_settings_continue_a_run_and_others_are_refused_by_name(config, folder):
     folder.open(config)
     folder.open(dataclasses.replace(config, num_threads=1))  # where it runs is no setting of the result
-    with pytest.raises(ValueError, match=r"sft.steps=250, now 7: use another --run-dir"):
+    with pytest.raises(ValueError, match=r"sft.steps=800, now 7: use another --run-dir"):
         folder.open(dataclasses.replace(config, sft=dataclasses.replace(config.sft, steps=7)))
     assert SFT().steps != 7
 
