@@ -50,7 +50,7 @@ class Explore:
 class WorldModel:
     """Video world model training on demonstrations and exploration."""
 
-    steps: int = 2000
+    steps: int = 1500
     refit_steps: int = 700
     """Steps of the later rounds, which continue from the model of the round before."""
     batch_size: int = 8

@@ -144,7 +144,60 @@ def test_over_the_physics_a_stop_leaves_the_rest_of_the_chunk_unexecuted():
     assert td["next", keys.NUM_STEPS].squeeze(-1).tolist() == [3, 3]
 
 
-@pytest.mark.parametrize(("settings", "message"), [({"threshold": 1.0}, "got 1.0"), ({"consecutive": 0}, "got 0")])
+class Length(Brightness):
+    """Scores a prefix by the number of its frames that are looked at: a tenth each."""
+
+    def logits(self, features: Tensor, lengths: Tensor, task_id: Tensor) -> Tensor:
+        return torch.logit(lengths / 10)
+
+
+def test_a_partial_reset_forgets_the_video_of_the_reset_rows_only():
+    env = TabletopEnv(TASK, 2, image_size=16, terminate_on_success=False, max_steps=8, num_threads=1)
+    env = TransformedEnv(env, Reflect(Length(), threshold=0.95))
+    td = env.reset()
+    torch.testing.assert_close(td[keys.SUCCESS_PROB].squeeze(-1), torch.tensor([0.1, 0.1]))
+    for _ in range(2):
+        td = env.step_mdp(env.step(td.set(keys.ACTION, torch.zeros(2, 7))))
+    td["_reset"] = torch.tensor([[True], [False]])
+    td = env.reset(td)
+    torch.testing.assert_close(td[keys.SUCCESS_PROB].squeeze(-1), torch.tensor([0.1, 0.3]))
+    td = env.step(td.set(keys.ACTION, torch.zeros(2, 7)))
+    torch.testing.assert_close(td["next", keys.SUCCESS_PROB].squeeze(-1), torch.tensor([0.2, 0.4]))
+    env.close()
+
+
+def test_rows_that_are_not_stepped_keep_their_video_and_score():
+    env = TabletopEnv(TASK, 2, image_size=16, terminate_on_success=False, max_steps=8, num_threads=1)
+    env = TransformedEnv(env, Reflect(Length(), threshold=0.95))
+    td = env.reset().set(keys.ACTION, torch.zeros(2, 7))
+    td["_step"] = torch.tensor([True, False])
+    td = env.step_mdp(env.step(td))
+    td["_step"] = torch.tensor([True, True])
+    td = env.step(td.set(keys.ACTION, torch.zeros(2, 7)))
+    torch.testing.assert_close(td["next", keys.SUCCESS_PROB].squeeze(-1), torch.tensor([0.3, 0.2]))
+    env.close()
+
+
+def test_fewer_frames_of_a_prefix_can_be_looked_at_and_the_reflector_itself_is_not_changed():
+    reflector = Length()
+    env = TabletopEnv(TASK, 1, image_size=16, terminate_on_success=False, max_steps=8, num_threads=1)
+    env = TransformedEnv(env, Reflect(reflector, threshold=0.95, num_frames=2))
+    scores = env.rollout(4, lambda td: td.set(keys.ACTION, torch.zeros(1, 7)))["next", keys.SUCCESS_PROB]
+    torch.testing.assert_close(scores.flatten(), torch.full((4,), 0.2))
+    assert reflector.num_frames == Reflector.num_frames == 32
+    env.close()
+
+
+def test_the_crossing_frame_ends_a_row_also_when_it_is_the_last_step_that_was_left():
+    wave = roll(imagined([[10, 20, 30, 40, 50, 60, 70, 250]]))
+    assert last(wave, "terminated").tolist() == [[True]]
+    assert last(wave, "truncated").tolist() == [[False]]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"threshold": 1.0}, "got 1.0"), ({"consecutive": 0}, "got 0"), ({"num_frames": 1}, "got 1")],
+)
 def test_settings_out_of_range_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         Reflect(Brightness(), **settings)

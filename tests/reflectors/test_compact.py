@@ -112,3 +112,5 @@ def test_frames_of_another_size_and_settings_out_of_range_are_refused(reflector)
         reflector.encode(torch.zeros(1, 3, 8, 8, dtype=torch.uint8))
     with pytest.raises(ValueError, match="threshold"):
         CompactReflectorConfig(num_tasks=1, threshold=1.5)
+    with pytest.raises(ValueError, match="num_frames must be at least 2"):
+        CompactReflectorConfig(num_tasks=1, num_frames=1)

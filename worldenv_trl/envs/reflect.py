@@ -42,7 +42,7 @@ class Reflect(Transform):
         consecutive: crossing frames in a row that end a rollout.
 
     Raises:
-        ValueError: for a threshold outside (0, 1), or ``consecutive`` below 1.
+        ValueError: for a threshold outside (0, 1), ``consecutive`` below 1 or ``num_frames`` below 2.
     """
 
     def __init__(
@@ -52,10 +52,11 @@ class Reflect(Transform):
             raise ValueError(f"threshold must be in (0, 1), got {threshold}")
         if consecutive < 1:
             raise ValueError(f"consecutive must be at least 1, got {consecutive}")
+        if num_frames is not None and num_frames < 2:
+            raise ValueError(f"num_frames must be at least 2, the first and the last frame, got {num_frames}")
         super().__init__(in_keys=[IMAGE], out_keys=[SUCCESS_PROB])
         self.reflector = reflector.eval().requires_grad_(False)
-        if num_frames is not None:
-            self.reflector.num_frames = num_frames
+        self.num_frames = num_frames
         self.threshold, self.consecutive = float(threshold), int(consecutive)
         self._features: Tensor | None = None
 
@@ -78,7 +79,8 @@ class Reflect(Transform):
         self._features[rows, 0] = self.reflector.encode(image.reshape(-1, *image.shape[-3:])[rows])
         self._seen[rows], self._streak[rows] = 1, 0
         task = tensordict_reset[TASK_ID].reshape(-1, 1)[rows]
-        self._prob[rows] = self.reflector.prefix_scores(self._features[rows, :1], torch.zeros_like(rows), 1, task)[:, 0]
+        first = self.reflector.prefix_scores(self._features[rows, :1], torch.zeros_like(rows), 1, task, self.num_frames)
+        self._prob[rows] = first[:, 0]
         tensordict_reset[SUCCESS_PROB] = self._prob.reshape(*batch, 1).clone()
         return tensordict_reset
 
@@ -133,7 +135,7 @@ class Reflect(Transform):
             self._features = torch.nn.functional.pad(self._features, (0, 0, 0, spare))
         place = seen.unsqueeze(-1) + torch.arange(count, device=rows.device)
         self._features[rows.unsqueeze(-1), place] = features
-        scores = self.reflector.prefix_scores(self._features[rows, :needed], seen, count, task_id)  # [n, C]
+        scores = self.reflector.prefix_scores(self._features[rows, :needed], seen, count, task_id, self.num_frames)
         streak, crossed = self._streak[rows], []
         for index in range(count):
             streak = torch.where(

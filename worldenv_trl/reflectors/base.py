@@ -55,18 +55,23 @@ class Reflector(nn.Module, abc.ABC):
         """Probabilities ``[P]``; see :meth:`logits`."""
         return self.logits(features, lengths, task_id).sigmoid()
 
-    def sample_prefixes(self, features: Tensor, rows: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+    def sample_prefixes(
+        self, features: Tensor, rows: Tensor, lengths: Tensor, num_frames: int | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Evenly sampled frames of prefixes: ``[P, L, F]`` and how many are in use ``[P]``.
 
         Args:
             features: ``[B, T, F]`` of whole videos.
             rows: int64 ``[P]``, the video of each prefix.
             lengths: int64 ``[P]``, its number of frames.
+            num_frames: most frames looked at; the reflector's own when None.
         """
-        index = prefix_indices(lengths, self.num_frames)
+        index = prefix_indices(lengths, self.num_frames if num_frames is None else num_frames)
         return features[rows.unsqueeze(-1), index], lengths.clamp(max=index.shape[1])
 
-    def prefix_scores(self, features: Tensor, first: Tensor, count: int, task_id: Tensor) -> Tensor:
+    def prefix_scores(
+        self, features: Tensor, first: Tensor, count: int, task_id: Tensor, num_frames: int | None = None
+    ) -> Tensor:
         """Scores of the prefixes that end at each of ``count`` new frames, in one batch.
 
         Args:
@@ -74,6 +79,7 @@ class Reflector(nn.Module, abc.ABC):
             first: int64 ``[B]``, frames before the new ones.
             count: new frames ``C``.
             task_id: int64 ``[B, 1]``.
+            num_frames: most frames of a prefix that are looked at; the reflector's own when None.
 
         Returns:
             ``[B, C]``: entry k is the score of the prefix of ``first + k + 1`` frames.
@@ -81,5 +87,5 @@ class Reflector(nn.Module, abc.ABC):
         batch = len(features)
         lengths = (first.unsqueeze(-1) + torch.arange(1, count + 1, device=first.device)).flatten()
         rows = torch.arange(batch, device=first.device).repeat_interleave(count)
-        sampled, used = self.sample_prefixes(features, rows, lengths)
+        sampled, used = self.sample_prefixes(features, rows, lengths, num_frames)
         return self.score(sampled, used, task_id[rows]).reshape(batch, count)

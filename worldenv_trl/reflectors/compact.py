@@ -43,6 +43,8 @@ class CompactReflectorConfig:
             raise ValueError(f"num_tasks must be at least 1, got {self.num_tasks}")
         if self.image_size < 16 or self.image_size % 8:
             raise ValueError(f"image_size must be a multiple of 8 px and at least 16, got {self.image_size}")
+        if self.num_frames < 2:
+            raise ValueError(f"num_frames must be at least 2, the first and the last frame, got {self.num_frames}")
         if not 0 < self.threshold < 1 or self.consecutive < 1:
             raise ValueError(
                 f"threshold must be in (0, 1) and consecutive at least 1, got {self.threshold} and {self.consecutive}"
