@@ -41,7 +41,7 @@ class Explore:
     """The policy's own rollouts in the scenes, at several multiples of its trained scale: data for both models."""
 
     episodes_per_task: int = 160
-    scale_factors: tuple[float, ...] = (0.0, 1.0, 1.5, 2.5)
+    scale_factors: tuple[float, ...] = (0.0, 0.5, 1.0, 2.0)
     """Multiples of the trained Laplace scale; the episodes are shared out equally. 0 is the greedy policy."""
     num_envs: int = 32
 
@@ -50,7 +50,7 @@ class Explore:
 class WorldModel:
     """Video world model training on demonstrations and exploration."""
 
-    steps: int = 1500
+    steps: int = 2400
     refit_steps: int = 700
     """Steps of the later rounds, which continue from the model of the round before."""
     batch_size: int = 8
@@ -89,7 +89,7 @@ class PostTrain:
 
     env: str = "imagined"
     """``imagined`` (the world model) or ``tabletop`` (the physics: the upper bound; same recipe otherwise)."""
-    iterations: int = 10
+    iterations: int = 24
     groups: int = 24
     group_size: int = 8
     epochs: int = 4
@@ -97,19 +97,21 @@ class PostTrain:
     clip_epsilon: float = 0.1
     ratio_level: str = "step"
     lora_rank: int = 16
-    lora_lr: float = 3e-5
-    head_lr: float = 3e-5
-    scale_factor: float = 2.0
-    """Behaviour and scored density use this multiple of the trained scale."""
+    lora_lr: float = 2e-4
+    head_lr: float = 2e-4
+    averaging: float = 0.8
+    """Decay per iteration of the running mean of the weights that is saved."""
+    scale_factor: float = 1.0
+    """Behaviour and scored density use this multiple of the policy's scale."""
     warmup_iterations: int = 2
-    max_kl: float = 0.3
+    max_kl: float = 0.1
     """An iteration's updates stop when the approximate KL per step exceeds this."""
     max_grad_norm: float = 1.0
     standardize: bool = True
     """Divide the advantages of a batch by their overall standard deviation (World-Env does not)."""
-    probe_every: int = 3
+    probe_every: int = 1
     """Iterations between greedy probes on training contexts in the physics (logged, never learned from); 0 is never."""
-    probe_contexts: int = 16
+    probe_contexts: int = 8
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,12 @@ class WorldEnvConfig:
     tasks: tuple[str, ...] = GOAL_TASKS
     image_size: int = 64
     chunk_length: int = 8
-    max_steps: int = 56
+    max_steps: int = 64
+    scale_floor: tuple[float, float, float] = (0.04, 0.0025, 0.15)
+    """Lower bound of the Laplace scale of position, rotation and gripper, in normalised action units.
+
+    The scale head learns what is left on the demonstrations, a few hundredths of what the policy is off elsewhere:
+    without a floor the rollouts of a group all end alike and LOOP learns nothing."""
     rounds: int = 1
     """Times that exploration, both models and LOOP run in turn, each with the policy reached so far."""
     demonstrate: Demonstrate = field(default_factory=Demonstrate)

@@ -8,11 +8,10 @@ from __future__ import annotations
 from tqdm import tqdm
 
 from config import WorldEnvConfig
-from parts import chunk_player, load_policy, seed_everything, step_env
+from parts import chunk_player, exploring_actor, load_policy, seed_everything, step_env
 from run_folder import RunFolder
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
-from worldenv_trl.policies import laplace_actor
 from worldenv_trl.record import RolloutWriter
 
 
@@ -35,7 +34,7 @@ def run(config: WorldEnvConfig, folder: RunFolder, policy: str = "sft", target: 
                 terminate_on_success=False,
                 seed=config.seed + 1000 * number + 17 * len(target),
             )
-            player = chunk_player(laplace_actor(model, scale_factor=max(factor, 1e-6)), config.chunk_length)
+            player = chunk_player(exploring_actor(config, model, max(factor, 1e-6)), config.chunk_length)
             collector = GroupCollector(
                 env,
                 player,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -16,7 +17,7 @@ from worldenv_trl import keys
 from worldenv_trl.data import concatenate_episodes, episodes_from_rollouts
 from worldenv_trl.envs import ImaginedEnv, Reflect, TabletopEnv, chunked
 from worldenv_trl.kinematics import ForwardKinematics
-from worldenv_trl.policies import OFTPolicy
+from worldenv_trl.policies import LaplaceActor, OFTPolicy, laplace_actor
 from worldenv_trl.record import read_rollouts
 from worldenv_trl.reflectors import CompactReflector
 from worldenv_trl.scenes import load_task
@@ -31,6 +32,8 @@ def check_config(config: WorldEnvConfig) -> None:
         raise ValueError("tasks is empty: name at least one task, for instance goal/open_the_top_drawer")
     if config.post_train.env not in ("imagined", "tabletop"):
         raise ValueError(f"post_train.env must be 'imagined' or 'tabletop', got {config.post_train.env!r}")
+    if not all(floor > 0 for floor in config.scale_floor):
+        raise ValueError(f"scale_floor must be positive, got {config.scale_floor}")
     if config.max_steps % config.chunk_length:
         raise ValueError(f"max_steps must be a multiple of chunk_length={config.chunk_length}, got {config.max_steps}")
     for task in config.tasks:
@@ -104,6 +107,13 @@ def stopping_rule(reflector: CompactReflector) -> Reflect:
 def chunk_player(actor, chunk_length: int) -> MultiStepActorWrapper:
     """Plays the actor's chunks open loop, one action a step. Its log-probs are stale: never train on them."""
     return MultiStepActorWrapper(actor, n_steps=chunk_length)
+
+
+def exploring_actor(config: WorldEnvConfig, policy: OFTPolicy, scale_factor: float) -> LaplaceActor:
+    """The stochastic actor of exploration and LOOP, its scale bounded below."""
+    position, rotation, gripper = (math.log(floor) for floor in config.scale_floor)
+    low = (*3 * [position], *3 * [rotation], gripper)
+    return laplace_actor(policy, scale_factor=scale_factor, log_scale_bounds=(low, max(-1.5, *(x + 1 for x in low))))
 
 
 def load_policy(folder: RunFolder, name: str, stage: str) -> OFTPolicy:

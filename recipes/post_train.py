@@ -6,12 +6,16 @@ Alone: ``python recipes/post_train.py improve --run-dir runs/improve``.
 
 from __future__ import annotations
 
+import math
+
 import torch
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from tqdm import tqdm
 
-from config import WorldEnvConfig
+from config import PostTrain, WorldEnvConfig
 from outcomes import greedy_outcomes, physics_outcomes
 from parts import (
+    exploring_actor,
     imagined_env,
     load_policy,
     load_reflector,
@@ -36,7 +40,7 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
     policy = load_policy(folder, source, "sft")
     if not policy.config.lora_rank:
         policy.add_lora(settings.lora_rank)
-    actor = laplace_actor(policy, scale_factor=settings.scale_factor)
+    actor = exploring_actor(config, policy, settings.scale_factor)
 
     shape = [settings.groups, settings.group_size]
     if settings.env == "imagined":
@@ -57,13 +61,16 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
     optimizer = torch.optim.AdamW(
         [{"params": lora, "lr": settings.lora_lr}, {"params": heads, "lr": settings.head_lr}], weight_decay=0.0
     )
-    final_rates = [group["lr"] for group in optimizer.param_groups]
+    full_rates = [group["lr"] for group in optimizer.param_groups]
+    # Single iterations are noisy: what is probed and saved is a running mean of the weights they reach.
+    mean = AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(settings.averaging))
+    mean_actor = laplace_actor(mean.module)
 
     progress = tqdm(collector, total=settings.iterations, desc=target, unit="it")
     for iteration, wave in enumerate(progress):
-        warmup = min(1.0, (iteration + 1) / (settings.warmup_iterations + 1))
-        for group, rate in zip(optimizer.param_groups, final_rates, strict=True):
-            group["lr"] = warmup * rate
+        factor = _rate_factor(iteration, settings)
+        for group, rate in zip(optimizer.param_groups, full_rates, strict=True):
+            group["lr"] = factor * rate
         returns = wave["returns"][..., 0]  # [G, N]
         advantage = rloo_advantage(returns)
         if settings.standardize:
@@ -83,11 +90,12 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
         total_steps = decisions[keys.STEP_MASK].sum()  # of Eq. 5: decisions that teach nothing count, too
         decisions = decisions[decisions[keys.ADVANTAGE].squeeze(-1) != 0]
         metrics = _update(decisions, total_steps, loss, optimizer, [lora, heads], settings)
+        mean.update_parameters(policy)
         collector.update_policy_weights_()
 
         metrics |= _wave_metrics(wave, returns)
         if settings.probe_every and (iteration % settings.probe_every == 0 or iteration == settings.iterations - 1):
-            metrics |= _probe(config, actor, imagination)
+            metrics |= _probe(config, mean_actor, imagination)
         folder.log(target, step=iteration, **metrics)
         progress.set_postfix({k: f"{metrics[k]:.3f}" for k in ("return", "kl_approx", "real_success") if k in metrics})
         if iteration in (0, settings.iterations - 1):
@@ -98,7 +106,13 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
             ) as writer:
                 writer.write(wave)
     collector.shutdown()
-    policy.save_pretrained(folder.checkpoint(target))
+    mean.module.save_pretrained(folder.checkpoint(target))
+
+
+def _rate_factor(iteration: int, settings: PostTrain) -> float:
+    """Linear warm-up, then half a cosine down to a tenth."""
+    warmup = (iteration + 1) / (settings.warmup_iterations + 1)
+    return min(warmup, 0.55 + 0.45 * math.cos(math.pi * iteration / settings.iterations))
 
 
 def _update(decisions, total_steps, loss, optimizer, parameter_groups, settings) -> dict[str, float]:

@@ -7,6 +7,7 @@ Alone: ``python recipes/train_reflector.py improve --run-dir runs/improve``.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -51,7 +52,7 @@ def run(
     rule = (settings.threshold, settings.consecutive)
     scores = {"real": all_scores(reflector, held_out), "imagined": all_scores(reflector, imagined_held_out)}
     if settings.choose_threshold:  # on training contexts that no part of the reflector has seen
-        rule = choose_rule(scores["imagined"], held_out)
+        rule = choose_rule(list(scores.values()), held_out)
     reflector.config = dataclasses.replace(reflector.config, threshold=rule[0], consecutive=rule[1])
     reflector.save_pretrained(folder.checkpoint(target))
     for name, values in scores.items():
@@ -177,15 +178,16 @@ def episode_figures(scores: torch.Tensor, episodes: TensorDict, rule: tuple[floa
     }
 
 
-def choose_rule(scores: torch.Tensor, episodes: TensorDict) -> tuple[float, int]:
-    """Threshold and consecutive frames with the best F1 of stopping."""
+def choose_rule(scores: Sequence[torch.Tensor], episodes: TensorDict) -> tuple[float, int]:
+    """Threshold and consecutive frames whose F1 of stopping, at its worst over ``scores`` (real, imagined), is best."""
 
-    def f1(rule: tuple[float, int]) -> float:
-        figures = episode_figures(scores, episodes, rule)
+    def f1(values: torch.Tensor, rule: tuple[float, int]) -> float:
+        figures = episode_figures(values, episodes, rule)
         precision, recall = figures["stop_precision"], figures["stop_recall"]
         return 2 * precision * recall / max(precision + recall, 1e-9)
 
-    return max(((threshold, run) for threshold in (0.5, 0.6, 0.7, 0.8, 0.9) for run in (1, 2, 3)), key=f1)
+    rules = ((threshold, run) for threshold in (0.5, 0.6, 0.7, 0.8, 0.9, 0.95) for run in (1, 2, 3))
+    return max(rules, key=lambda rule: min(f1(values, rule) for values in scores))
 
 
 if __name__ == "__main__":

@@ -62,6 +62,15 @@ def test_log_scales_outside_the_bounds_are_clamped(policy, batch):
     torch.testing.assert_close(out[SCALE], torch.full_like(out[SCALE], -4.0).exp())
 
 
+def test_each_action_dimension_can_have_bounds_of_its_own(policy, batch):
+    torch.nn.init.constant_(policy.scale_head.linear_out.bias, -9.0)
+    low = torch.tensor([-3.0, -3.0, -3.0, -5.0, -5.0, -5.0, -2.0])
+    out = laplace_actor(policy, log_scale_bounds=(low.tolist(), -1.0), scale_factor=2.0)(batch)
+    torch.testing.assert_close(out[SCALE], 2 * low.exp().expand_as(out[SCALE]))
+    with pytest.raises(ValueError, match="low < high"):
+        laplace_actor(policy, log_scale_bounds=(low.tolist(), -2.5))
+
+
 @pytest.mark.parametrize(("event_dims", "shape"), [(0, (6, 8, 7)), (1, (6, 8)), (2, (6,))])
 def test_event_dims_set_the_shape_of_the_log_probs(policy, batch, event_dims, shape):
     assert laplace_actor(policy, event_dims=event_dims)(batch)[LOG_PROBS].shape == shape

@@ -90,14 +90,16 @@ def test_image_and_proprioception_change_the_actions(observation):
 
 def test_statistics_are_the_quantile_bounds_of_the_data(observation):
     policy = build()
-    states = torch.linspace(-3, 1, 1001)[:, None].expand(-1, 7)
+    states = torch.linspace(-3, 1, 1001)[:, None].repeat(1, 7)
     actions = torch.linspace(0, 0.5, 1001)[:, None].repeat(1, 7)
-    actions[:, 6] = 0
+    actions[:, 6] = states[:, 5] = 0
     policy.fit_statistics(states, actions)
-    torch.testing.assert_close(policy.state_center, torch.full((7,), -1.0))
-    torch.testing.assert_close(policy.state_half_range, torch.full((7,), 4 * 0.49))
+    moving = torch.arange(7) != 5
+    torch.testing.assert_close(policy.state_center[moving], torch.full((6,), -1.0))
+    torch.testing.assert_close(policy.state_half_range[moving], torch.full((6,), 4 * 0.49))
+    assert policy.state_half_range[5] == pytest.approx(0.05)
     torch.testing.assert_close(policy.action_half_range[:6], torch.full((6,), 0.5 * 0.49))
-    assert policy.action_half_range[6] == pytest.approx(0.05)
+    assert policy.action_half_range[6] == pytest.approx(0.005)
 
 
 def test_a_state_in_other_units_changes_nothing_once_its_statistics_are_fitted(observation):

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, NonTensor, Unbounded
 from torchrl.envs import EnvBase
 
+from worldenv_trl.envs.contexts import CONTEXT_KEYS, check_contexts, instructions_of
 from worldenv_trl.keys import (
     ACTION_DIM,
     CHUNK,
@@ -32,7 +33,6 @@ from worldenv_trl.kinematics import ForwardKinematics
 __all__ = ["ImaginedEnv"]
 
 _PADDED_ACTION_DIM = 14  # the world model's dual-arm interface; a single arm fills the first seven
-_CONTEXT_KEYS = (IMAGE, STATE, KINEMATIC_STATE, TASK_ID, CONTEXT_ID)
 
 
 class ImaginedEnv(EnvBase):
@@ -92,7 +92,7 @@ class ImaginedEnv(EnvBase):
             raise ValueError(f"max_steps and chunk_length must be at least 1, got {max_steps} and {chunk_length}")
         if proprio not in ("commanded", "measured"):
             raise ValueError(f'proprio must be "commanded" or "measured", got {proprio!r}')
-        _check_contexts(contexts)
+        check_contexts(contexts, kinematics)
         trained_for = getattr(world_model, "chunk_length", chunk_length)
         if trained_for != chunk_length:
             raise ValueError(f"the world model paints chunks of {trained_for} frames, chunk_length is {chunk_length}")
@@ -101,9 +101,8 @@ class ImaginedEnv(EnvBase):
 
         self.world_model, self.kinematics = world_model, kinematics
         self.max_steps, self.chunk_length, self.proprio = int(max_steps), int(chunk_length), proprio
-        self._contexts = contexts.select(*_CONTEXT_KEYS).to(device).contiguous()
-        _check_state(self._contexts, kinematics)
-        self._instructions = _instructions_of(contexts)
+        self._contexts = contexts.select(*CONTEXT_KEYS).to(device).contiguous()
+        self._instructions = instructions_of(contexts)
         self._make_specs(tuple(self._contexts[IMAGE].shape[1:]))
         self._make_buffers(tuple(self._contexts[IMAGE].shape[1:]))
         self._set_seed(seed)
@@ -232,16 +231,16 @@ class ImaginedEnv(EnvBase):
     def _given(self, tensordict: TensorDictBase | None, rows: Tensor) -> tuple[TensorDictBase, list[str]]:
         """The contexts of ``rows`` that the caller put into the reset's tensordict."""
         keys = set() if tensordict is None else set(tensordict.keys(True, True))
-        missing = [key for key in _CONTEXT_KEYS if key not in keys]
+        missing = [key for key in CONTEXT_KEYS if key not in keys]
         if missing:
-            raise ValueError(f"reset(set_state=True) needs {list(_CONTEXT_KEYS)} in its tensordict; missing: {missing}")
-        start = tensordict.select(*_CONTEXT_KEYS).to(self.device).flatten(0, 1)[rows]
+            raise ValueError(f"reset(set_state=True) needs {list(CONTEXT_KEYS)} in its tensordict; missing: {missing}")
+        start = tensordict.select(*CONTEXT_KEYS).to(self.device).flatten(0, 1)[rows]
         if start[IMAGE].shape[1:] != self._video.shape[2:]:
             raise ValueError(
                 f"the contexts' images are {tuple(start[IMAGE].shape[1:])}, this env's {tuple(self._video.shape[2:])}"
             )
         if INSTRUCTION in tensordict.keys():  # noqa: SIM118 - a TensorDict iterates over rows
-            text = _instructions_of(tensordict.select(INSTRUCTION).flatten(0, 1))
+            text = instructions_of(tensordict.select(INSTRUCTION).flatten(0, 1))
             return start, [text[row] for row in rows.tolist()]
         by_task = dict(zip(self._contexts[TASK_ID].flatten().tolist(), self._instructions, strict=True))
         return start, [by_task.get(task, "") for task in start[TASK_ID].flatten().tolist()]
@@ -378,39 +377,3 @@ def _mix(value: Tensor) -> Tensor:
     value = (value ^ ((value >> 30) & (2**34 - 1))) * -4658895280553007687
     value = (value ^ ((value >> 27) & (2**37 - 1))) * -7723592293110705685
     return value ^ ((value >> 31) & (2**33 - 1))
-
-
-def _instructions_of(contexts: TensorDictBase) -> list[str]:
-    text = contexts.get(INSTRUCTION)
-    if isinstance(text, str):
-        return [text] * len(contexts)
-    return [str(words) for words in text.tolist()]
-
-
-def _check_contexts(contexts: TensorDictBase) -> None:
-    if contexts.ndim != 1 or len(contexts) == 0:
-        raise ValueError(
-            f"contexts must be a TensorDict [K] of at least one initial state, got batch size {list(contexts.shape)}; "
-            "collect them with TabletopEnv(...).reset()"
-        )
-    missing = [key for key in (*_CONTEXT_KEYS, INSTRUCTION) if contexts.get(key, None) is None]
-    if missing:
-        raise ValueError(f"contexts lack the entries {missing}; take them from TabletopEnv(...).reset()")
-    count = len(contexts)
-    image = contexts[IMAGE]
-    if image.dtype != torch.uint8 or image.ndim != 4 or image.shape[1] != 3:
-        raise ValueError(f"the contexts' {IMAGE} must be uint8 [K, 3, H, W], got {image.dtype} {tuple(image.shape)}")
-    for key, width in ((STATE, STATE_DIM), (KINEMATIC_STATE, KINEMATIC_DIM), (TASK_ID, 1), (CONTEXT_ID, 1)):
-        if tuple(contexts[key].shape) != (count, width):
-            raise ValueError(f"the contexts' {key} must be {(count, width)}, got {tuple(contexts[key].shape)}")
-
-
-def _check_state(contexts: TensorDictBase, kinematics: ForwardKinematics) -> None:
-    """The proprioception and the joints must tell the same story: both come from the same robot, at rest."""
-    apart = (kinematics.pose(contexts[KINEMATIC_STATE])[:, :3] - contexts[STATE][:, :3]).norm(dim=-1)
-    worst = int(apart.argmax())
-    if not float(apart[worst]) < 0.05:
-        raise ValueError(
-            f"context {int(contexts[CONTEXT_ID][worst])}: its state is {float(apart[worst]):.3f} m away from the "
-            "forward kinematics of its joints; the contexts were recorded with another robot"
-        )

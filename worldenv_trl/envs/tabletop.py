@@ -173,7 +173,9 @@ class TabletopEnv(EnvBase):
             self._limit[block.rows] = task.max_steps if max_steps is None else max_steps
             for row in block.rows:
                 words[row] = task.language
-        self._text = NonTensorStack(*(NonTensorData(text) for text in words))
+        # One text for all rows costs nothing; a stack is copied row by row at every step.
+        stack = NonTensorStack(*(NonTensorData(text) for text in words))
+        self._text = NonTensorData(words[0], batch_size=[n]) if len(set(words)) == 1 else stack
 
     def _make_specs(self) -> None:
         batch = self.batch_size

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -13,12 +14,16 @@ from torchrl.modules import ProbabilisticActor
 from worldenv_trl.keys import CHUNK, IMAGE, LOC, LOG_PROBS, LOG_SCALE, SCALE, STATE, TASK_ID
 from worldenv_trl.policies.laplace import IndependentLaplace
 
+Bound = float | Sequence[float]
+
 
 class _LaplaceParameters(nn.Module):
-    def __init__(self, policy: nn.Module, scale_factor: float, log_scale_bounds: tuple[float, float] | None):
+    def __init__(self, policy: nn.Module, scale_factor: float, log_scale_bounds: tuple[Bound, Bound] | None):
         super().__init__()
         self.policy = policy
-        self.log_scale_bounds = log_scale_bounds
+        low, high = (None, None) if log_scale_bounds is None else map(torch.as_tensor, log_scale_bounds)
+        self.register_buffer("log_scale_low", low, persistent=False)
+        self.register_buffer("log_scale_high", high, persistent=False)
         # A buffer: losses that hold a functional copy of this module share it and follow in-place changes.
         self.register_buffer("scale_factor", torch.tensor(float(scale_factor)), persistent=False)
 
@@ -26,7 +31,7 @@ class _LaplaceParameters(nn.Module):
         self, image: torch.Tensor, state: torch.Tensor, task_id: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         loc, log_scale = self.policy(image, state, task_id)
-        bounded = log_scale if self.log_scale_bounds is None else log_scale.clamp(*self.log_scale_bounds)
+        bounded = log_scale if self.log_scale_low is None else log_scale.clamp(self.log_scale_low, self.log_scale_high)
         return loc, log_scale, bounded.exp() * self.scale_factor
 
 
@@ -52,7 +57,7 @@ def laplace_actor(
     *,
     event_dims: int = 1,
     scale_factor: float = 1.0,
-    log_scale_bounds: tuple[float, float] | None = (-6.0, -1.5),
+    log_scale_bounds: tuple[Bound, Bound] | None = (-6.0, -1.5),
     loc_key: NestedKey = LOC,
     scale_key: NestedKey = SCALE,
 ) -> LaplaceActor:
@@ -66,14 +71,20 @@ def laplace_actor(
         policy: for example :class:`~worldenv_trl.policies.OFTPolicy`.
         event_dims: trailing dimensions of ``[*B, C, 7]`` summed in the log-probability.
         scale_factor: exploration width relative to the trained scale, positive.
-        log_scale_bounds: where the log-scale is clamped, or None. Its gradient is zero outside.
+        log_scale_bounds: where the log-scale is clamped: (low, high), each one number or one for each action
+            dimension, or None. Its gradient is zero outside. A scale head that has learned the residuals on a few
+            demonstrations is far too sure of itself (a tenth of the error on new scenes): the lower bound is what
+            exploration lives on.
         loc_key, scale_key: ``BCLoss`` takes the negative log-likelihood only of actors that write keys named plainly
             ``"loc"`` or ``"scale"`` (it falls back to squared errors of the mode, silently): for the scale-head stage
             use :func:`likelihood_actor`.
     """
     scale_factor = _positive(scale_factor)
-    if log_scale_bounds is not None and not log_scale_bounds[0] < log_scale_bounds[1]:
-        raise ValueError(f"log_scale_bounds must be (low, high) with low < high, got {log_scale_bounds}")
+    if log_scale_bounds is not None:
+        low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in log_scale_bounds)
+        if not (low < high).all():
+            raise ValueError(f"log_scale_bounds must be (low, high) with low < high, got {log_scale_bounds}")
+        log_scale_bounds = (low, high)
     module = TensorDictModule(
         _LaplaceParameters(policy, scale_factor, log_scale_bounds),
         in_keys=[IMAGE, STATE, TASK_ID],

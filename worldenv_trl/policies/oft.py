@@ -329,15 +329,19 @@ class OFTPolicy(nn.Module, Pretrained):
 
     @torch.no_grad()
     def fit_statistics(self, states: torch.Tensor, actions: torch.Tensor) -> None:
-        """Takes the bounds of proprioception and actions from data, ``[..., 7]`` each; half-ranges are at least .05."""
-        for name, values in (("state", states), ("action", actions)):
+        """Takes the bounds of proprioception and actions from data, ``[..., 7]`` each.
+
+        Half-ranges are at least .05 (states) and .005 (actions), so that a dimension which hardly moves is not blown up
+        into noise. An action's floor also sets how far that dimension answers to a change of the hidden state: at .05,
+        rotations that the demonstrations never use took most of LOOP's gradient.
+        """
+        for name, values, floor in (("state", states, 0.05), ("action", actions, 0.005)):
             flat = values.reshape(-1, values.shape[-1]).float()
             if flat.shape[0] == 0 or not torch.isfinite(flat).all():
                 raise ValueError(f"{name}s must hold at least one row and only finite numbers")
             low, high = torch.quantile(flat, torch.tensor([0.01, 0.99]).to(flat), dim=0)
             getattr(self, f"{name}_center").copy_((low + high) / 2)
-            # A floor, so that a dimension which hardly moves is not blown up into noise.
-            getattr(self, f"{name}_half_range").copy_(((high - low) / 2).clamp(min=0.05))
+            getattr(self, f"{name}_half_range").copy_(((high - low) / 2).clamp(min=floor))
 
     def backbone_parameters(self) -> Iterator[nn.Parameter]:
         """Everything but the heads, adapters included."""

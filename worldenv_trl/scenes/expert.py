@@ -148,10 +148,10 @@ def _pull_open(cabinet: str, drawer: str) -> list[_Phase]:
 
     def hooked(scene: SceneBatch) -> np.ndarray:
         x, y, z = (_tcp(scene) - handle(scene)).T
-        return (np.abs(x) < 0.04) & (y < 0.0) & (y > -0.065) & (np.abs(z) < 0.025)
+        return (np.abs(x) < Cabinet.HANDLE_HALF_WIDTH + 0.008) & (y < 0.0) & (y > -0.065) & (np.abs(z) < 0.025)
 
     # The closed fingers hook the bar from behind.
-    hook = 0.032
+    hook = 0.5 * Cabinet.HANDLE_REACH
     return [
         _Phase(lambda s, m: handle(s, 0.07, hook), _CLOSE, tolerance=0.02),
         _Phase(lambda s, m: handle(s, 0.0, hook), _CLOSE, tolerance=0.008),

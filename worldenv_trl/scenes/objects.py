@@ -78,6 +78,7 @@ class Cabinet(_Primitive):
     """
 
     OPEN_BELOW = -0.14
+    HANDLE_HALF_WIDTH, HANDLE_REACH = 0.034, 0.060  # half the bar's length; how far it stands out from the front
     DEPTH, WIDTH, LEVELS = 0.10, 0.085, (("bottom", 0.03), ("middle", 0.085), ("top", 0.14))
 
     def _shape(self, body: mjcf.Element) -> None:
@@ -123,13 +124,26 @@ class Cabinet(_Primitive):
                 drawer.add(
                     "geom",
                     type="box",
-                    pos=(side * 0.040, back + 0.033, 0.007),
-                    size=(0.005, 0.031, 0.005),
+                    pos=(side * (self.HANDLE_HALF_WIDTH - 0.004), back + 0.5 * self.HANDLE_REACH, 0.007),
+                    size=(0.004, 0.5 * self.HANDLE_REACH - 0.002, 0.005),
                     mass=0.01,
                     **metal,
                 )
-            drawer.add("geom", type="box", pos=(0, back + 0.065, 0.007), size=(0.045, 0.006, 0.007), mass=0.03, **metal)
-            drawer.add("site", name=f"{name}_handle", pos=(0, back + 0.065, 0.007), size=(0.003,), rgba=(0, 0, 0, 0))
+            drawer.add(
+                "geom",
+                type="box",
+                pos=(0, back + self.HANDLE_REACH, 0.007),
+                size=(self.HANDLE_HALF_WIDTH, 0.006, 0.007),
+                mass=0.03,
+                **metal,
+            )
+            drawer.add(
+                "site",
+                name=f"{name}_handle",
+                pos=(0, back + self.HANDLE_REACH, 0.007),
+                size=(0.003,),
+                rgba=(0, 0, 0, 0),
+            )
 
 
 class Stove(_Primitive):

@@ -12,6 +12,7 @@ import weakref
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from PIL import Image
 
 _BACKEND = os.environ.get("MUJOCO_GL", "the default")
 _REMEDY = (
@@ -31,6 +32,10 @@ except ModuleNotFoundError:
     raise
 except (ImportError, AttributeError, RuntimeError) as error:
     raise ImportError(f"GL cannot be loaded with MUJOCO_GL={_BACKEND!r} ({error}): {_REMEDY}") from error
+
+# Twice the pixels each way and a mean: in software GL cheaper than MuJoCo's four samples a pixel, and unlike those not
+# done under a lock that all contexts share, so that two threads draw nearly twice as fast as one.
+SUPERSAMPLING = 2
 
 Paint = Callable[[mujoco.MjModel, np.ndarray], None]
 
@@ -117,14 +122,17 @@ class _Painter:
         return self._results.get()
 
     def _run(self, model: mujoco.MjModel, image_size: int, paint: Paint | None) -> None:
+        fine = SUPERSAMPLING * image_size
+        model.vis.quality.offsamples = 0
+        model.vis.global_.offwidth = model.vis.global_.offheight = fine
         try:
-            renderer = mujoco.Renderer(model, image_size, image_size)
+            renderer = mujoco.Renderer(model, fine, fine)
         except Exception as error:
             self._results.put(error)
             return
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        data, frame = mujoco.MjData(model), np.empty((image_size, image_size, 3), np.uint8)
+        data, frame = mujoco.MjData(model), np.empty((fine, fine, 3), np.uint8)
         self._results.put(None)
         while (job := self._jobs.get()) is not None:
             qpos, mocap_pos, rows, images = job
@@ -137,11 +145,17 @@ class _Painter:
                         paint(model, qpos[row])
                     for name, batch in images.items():
                         renderer.update_scene(data, name)
-                        batch[row] = renderer.render(out=frame).transpose(2, 0, 1)
+                        batch[row] = _shrunk(renderer.render(out=frame)).transpose(2, 0, 1)
                 self._results.put(None)
             except Exception as error:
                 self._results.put(error)
         renderer.close()
+
+
+def _shrunk(frame: np.ndarray) -> np.ndarray:
+    """Means of the ``SUPERSAMPLING x SUPERSAMPLING`` blocks of ``[H, W, 3]`` uint8, rounded."""
+    image = Image.frombuffer("RGB", frame.shape[1::-1], frame, "raw", "RGB", 0, 1)
+    return np.asarray(image.reduce(SUPERSAMPLING))
 
 
 def _stop(painters: list[_Painter]) -> None:

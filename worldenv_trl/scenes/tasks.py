@@ -108,17 +108,17 @@ _TASKS: tuple[Task, ...] = (
     _goal_task(
         0, "put_the_bowl_on_the_plate", "put the bowl on the plate", ("On", "bowl", "plate"),
         (
-            Placement("bowl", Bowl, (0.00, -0.10), (0.045, 0.045), radius=0.065),
+            Placement("bowl", Bowl, (0.00, -0.10), (0.042, 0.042), radius=0.065),
             Placement("plate", Plate, (0.03, 0.12), (0.040, 0.035), radius=0.095),
         ),
     ),
     _goal_task(
         1, "open_the_top_drawer", "open the top drawer of the cabinet", ("Open", "cabinet", "top"),
-        (Placement("cabinet", Cabinet, (0.03, -0.11), (0.070, 0.050), fixture=True, radius=0.15),),
+        (Placement("cabinet", Cabinet, (0.03, -0.11), (0.100, 0.065), fixture=True, radius=0.15),),
     ),
     _goal_task(
         2, "turn_on_the_stove", "turn on the stove", ("TurnOn", "stove"),
-        (Placement("stove", Stove, (0.06, 0.02), (0.080, 0.060), fixture=True, radius=0.18),),
+        (Placement("stove", Stove, (0.035, 0.02), (0.110, 0.090), fixture=True, radius=0.18),),
     ),
 )  # fmt: skip
 

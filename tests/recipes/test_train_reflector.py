@@ -1,0 +1,41 @@
+"""The choice of the stopping rule, on scores made by hand."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+
+from train_reflector import choose_rule, episode_figures, stops
+
+FRAMES = 12
+
+
+def episodes(first_success: list[int]) -> TensorDict:
+    """One episode each; -1 never succeeds."""
+    time = torch.arange(FRAMES)
+    success = torch.stack([(time >= first) if first >= 0 else time < 0 for first in first_success])
+    length = torch.full((len(first_success), 1), FRAMES - 1)
+    return TensorDict({"success": success, "length": length}, batch_size=[len(first_success)])
+
+
+def test_a_rule_stops_at_the_end_of_the_first_run_above_the_threshold():
+    scores = torch.zeros(2, FRAMES)
+    scores[0, [2, 5, 6, 7]] = 0.9
+    scores[1, 4] = 0.9
+    data = episodes([5, -1])
+    assert stops(scores, data, (0.5, 1)).tolist() == [2, 4]
+    assert stops(scores, data, (0.5, 2)).tolist() == [6, -1]
+    assert episode_figures(scores, data, (0.5, 1)) == {"stop_precision": 0.0, "stop_recall": 0.0}
+    assert episode_figures(scores, data, (0.5, 2)) == {"stop_precision": 1.0, "stop_recall": 1.0}
+
+
+def test_the_rule_must_hold_on_real_and_on_imagined_frames():
+    data = episodes([5, 6, -1, -1])
+    real, imagined = torch.zeros(2, 4, FRAMES).unbind(0)
+    real[:2, 6:], imagined[:2, 6:] = 0.97, 0.97
+    imagined[2:, 3] = 0.99  # a flicker: one frame is not enough here
+    real[2:, 3:] = 0.85  # sure of itself for long, but never above 0.9: the threshold must be high there
+    assert choose_rule([imagined], data)[1] > 1
+    assert choose_rule([real], data)[0] >= 0.9
+    threshold, consecutive = choose_rule([real, imagined], data)
+    assert threshold >= 0.9 and consecutive > 1
