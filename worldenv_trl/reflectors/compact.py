@@ -13,6 +13,8 @@ from worldenv_trl.reflectors.base import Reflector
 
 __all__ = ["CompactReflector", "CompactReflectorConfig"]
 
+_FRAMES_PER_CALL = 64
+
 
 @dataclass(frozen=True)
 class CompactReflectorConfig:
@@ -113,7 +115,9 @@ class CompactReflector(Reflector, Pretrained):
         if frames.ndim != 4 or tuple(frames.shape[1:]) != (3, self.config.image_size, self.config.image_size):
             size = self.config.image_size
             raise ValueError(f"frames must be [n, 3, {size}, {size}], got {list(frames.shape)}")
-        return self.encoder(_scaled(frames))
+        # On a CPU, calls whose activations fit the cache are nearly three times as fast.
+        count = _FRAMES_PER_CALL if frames.device.type == "cpu" else max(1, len(frames))
+        return torch.cat([self.encoder(_scaled(part)) for part in frames.split(count)])
 
     def logits(self, features: Tensor, lengths: Tensor, task_id: Tensor) -> Tensor:
         rows = torch.arange(len(features), device=features.device)
