@@ -67,21 +67,28 @@ def run(
         )
 
 
-def _draw_frames(episodes: TensorDict, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Episode and frame of ``count`` frames, successes as likely as failures where there are any."""
-    success = episodes["success"] & (torch.arange(episodes["success"].shape[1]) <= episodes["length"])
-    failure = ~episodes["success"] & (torch.arange(episodes["success"].shape[1]) <= episodes["length"])
-    pools = [pool.nonzero() for pool in (success, failure) if pool.any()]
-    drawn = [pool[torch.randint(len(pool), (count // len(pools),))] for pool in pools]
-    return torch.cat(drawn).unbind(-1)
+class _FrameSampler:
+    """Draws frames: every task equally often, and of each task successes as often as failures."""
+
+    def __init__(self, episodes: TensorDict) -> None:
+        alive, success = _alive(episodes), episodes["success"]
+        task = episodes[keys.TASK_ID]  # [R, 1]
+        wanted = [(task == number) & alive & (success == label) for number in task.unique() for label in (True, False)]
+        self.pools = [pool.nonzero() for pool in wanted if pool.any()]
+
+    def __call__(self, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Episode and frame of ``count`` frames, or a few less."""
+        share = max(1, count // len(self.pools))
+        return torch.cat([pool[torch.randint(len(pool), (share,))] for pool in self.pools]).unbind(-1)
 
 
 def _train_encoder(reflector: CompactReflector, episodes: TensorDict, settings, folder: RunFolder, target: str) -> None:
     parameters = reflector.encoder_parameters()
     optimizer = torch.optim.AdamW(parameters, lr=settings.lr, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, settings.lr, total_steps=settings.encoder_steps)
+    draw = _FrameSampler(episodes)
     for step in trange(settings.encoder_steps, desc=f"{target} encoder", unit="step"):
-        row, frame = _draw_frames(episodes, 2 * settings.batch_size)
+        row, frame = draw(2 * settings.batch_size)
         both = torch.cat([episodes["frames"][row, frame], episodes["frames"][row, 0]], 1)
         both = _shifted_together(both)
         now, first = (blurred(images, float(torch.rand(()))) for images in both.split(3, 1))
@@ -108,8 +115,9 @@ def _train_head(reflector: CompactReflector, episodes: TensorDict, settings, fol
     loss = ReflectorLoss(reflector, label_smoothing=0.02)
     optimizer = torch.optim.AdamW(reflector.head_parameters(), lr=settings.lr, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, settings.lr, total_steps=settings.steps)
+    draw = _FrameSampler(episodes)
     for step in trange(settings.steps, desc=f"{target} head", unit="step"):
-        row, frame = _draw_frames(episodes, 2 * settings.batch_size)
+        row, frame = draw(2 * settings.batch_size)
         sampled, used = reflector.sample_prefixes(features, row, frame + 1)
         batch = TensorDict(
             {

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict
 
-from train_reflector import choose_rule, episode_figures, stops
+from train_reflector import _FrameSampler, choose_rule, episode_figures, stops
+from worldenv_trl import keys
 
 FRAMES = 12
 
@@ -39,3 +40,15 @@ def test_the_rule_must_hold_on_real_and_on_imagined_frames():
     assert choose_rule([real], data)[0] >= 0.9
     threshold, consecutive = choose_rule([real, imagined], data)
     assert threshold >= 0.9 and consecutive > 1
+
+
+def test_frames_are_drawn_evenly_over_tasks_and_outcomes_and_never_past_the_end():
+    data = episodes([10, 3, 2, -1, 1])
+    data[keys.TASK_ID] = torch.tensor([[0], [1], [1], [1], [1]])
+    data["length"] = torch.tensor([[FRAMES - 1], [5], [FRAMES - 1], [4], [FRAMES - 1]])
+    row, frame = _FrameSampler(data)(4000)
+    assert len(row) == 4000 and (frame <= data["length"][row].squeeze(-1)).all()
+    for task in (0, 1):
+        drawn = data[keys.TASK_ID][row].squeeze(-1) == task
+        assert int(drawn.sum()) == 2000
+        assert int(data["success"][row, frame][drawn].sum()) == 1000
