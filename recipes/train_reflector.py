@@ -38,8 +38,11 @@ def run(
     world_model, kinematics = load_world_model(folder, models), ForwardKinematics()
     share = min(1.0, settings.imagined_share / max(1e-6, 1 - settings.imagined_share))
     chosen = torch.randperm(len(training))[: round(share * len(training))]
-    imagined = [imagine_episodes(world_model, training[chosen], kinematics, seed=config.seed)] if len(chosen) else []
-    episodes = concatenate_episodes([demonstrations, training, *imagined])
+    episodes = concatenate_episodes([demonstrations, training])
+    if len(chosen):
+        label = f"{target} imagines"
+        imagined = imagine_episodes(world_model, training[chosen], kinematics, seed=config.seed, progress=label)
+        episodes = concatenate_episodes([episodes, imagined])
     imagined_held_out = imagine_episodes(world_model, held_out, kinematics, seed=config.seed + 1)
 
     tasks = max(load_task(task).task_id for task in config.tasks) + 1

@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
+from tqdm import tqdm
 
 from worldenv_trl.keys import ACTION_DIM, FRAMES, TASK_ID
 from worldenv_trl.kinematics import ForwardKinematics
@@ -24,6 +25,7 @@ def imagine_episodes(
     *,
     rows_at_once: int = 64,
     seed: int = 0,
+    progress: str | None = None,
 ) -> TensorDict:
     """The same actions from the same first frames, imagined open loop on the model's own frames.
 
@@ -35,14 +37,16 @@ def imagine_episodes(
     Keyword Args:
         rows_at_once: episodes in memory at a time.
         seed: of the model's noise, for each episode and chunk.
+        progress: label of a progress bar; None shows none.
 
     Returns:
         ``episodes`` with ``frames`` uint8 [R, T+1, 3, H, W] imagined (the first is real) and ``kinematic_states``
         predicted; ``success`` stays that of the physics under the same actions.
     """
+    starts = range(0, len(episodes), rows_at_once)
     parts = [
         _imagine(world_model, episodes[start : start + rows_at_once], kinematics, seed + start)
-        for start in range(0, len(episodes), rows_at_once)
+        for start in tqdm(starts, desc=progress, unit="batch", disable=progress is None)
     ]
     out = episodes.clone(False)
     out["frames"] = torch.cat([frames for frames, _ in parts])
