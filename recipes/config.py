@@ -77,6 +77,8 @@ class Reflector:
     lr: float = 1e-3
     imagined_share: float = 0.5
     """Share of the training episodes that are imagined replays of recorded actions, labelled by the physics."""
+    holdout: float = 0.2
+    """Share of the exploration's initial states kept out, for the figures and for the choice of the stopping rule."""
     threshold: float = 0.5
     consecutive: int = 1
     choose_threshold: bool = False
@@ -164,6 +166,6 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
     ),
     "improve": (
         "Post-training that raises held-out success; at most 60 minutes on 2 cores.",
-        WorldEnvConfig(run_dir=Path("runs/improve"), reflector=Reflector(choose_threshold=True)),
+        WorldEnvConfig(run_dir=Path("runs/improve"), rounds=2, reflector=Reflector(choose_threshold=True)),
     ),
 }

@@ -34,7 +34,7 @@ def run(
     settings = config.reflector
     seed_everything(config, offset=40 + rounds)
     demonstrations, explored = read_episodes(folder, rounds)
-    training, held_out = split_by_context(explored, config.world_model.holdout, config.seed)
+    training, held_out = split_by_context(explored, settings.holdout, config.seed)
     world_model, kinematics = load_world_model(folder, models), ForwardKinematics()
     share = min(1.0, settings.imagined_share / max(1e-6, 1 - settings.imagined_share))
     chosen = torch.randperm(len(training))[: round(share * len(training))]
@@ -59,15 +59,25 @@ def run(
     reflector.config = dataclasses.replace(reflector.config, threshold=rule[0], consecutive=rule[1])
     reflector.save_pretrained(folder.checkpoint(target))
     for name, values in scores.items():
-        frames = frame_figures(values, held_out, rule[0])
-        folder.log(
-            target,
-            rollouts=name,
-            threshold=rule[0],
-            consecutive=rule[1],
-            **frames,
-            **episode_figures(values, held_out, rule),
-        )
+        for task in ("all", *config.tasks):
+            rows = torch.ones(len(held_out), dtype=torch.bool)
+            if task != "all":
+                rows = held_out[keys.TASK_ID].squeeze(-1) == load_task(task).task_id
+            if rows.any():
+                _log_figures(folder, target, rule, name, task, values[rows], held_out[rows])
+
+
+def _log_figures(folder: RunFolder, target: str, rule, rollouts: str, task: str, scores, episodes) -> None:
+    folder.log(
+        target,
+        rollouts=rollouts,
+        task=task,
+        episodes=len(episodes),
+        threshold=rule[0],
+        consecutive=rule[1],
+        **frame_figures(scores, episodes, rule[0]),
+        **episode_figures(scores, episodes, rule),
+    )
 
 
 class _FrameSampler:
@@ -190,14 +200,21 @@ def episode_figures(scores: torch.Tensor, episodes: TensorDict, rule: tuple[floa
 
 
 def choose_rule(scores: Sequence[torch.Tensor], episodes: TensorDict) -> tuple[float, int]:
-    """Threshold and consecutive frames whose F1 of stopping, at its worst over ``scores`` (real, imagined), is best."""
+    """Threshold and consecutive frames with the best F1 of stopping, averaged over tasks.
+
+    Of several ``scores`` of the same episodes (on real and on imagined frames) the worse one counts.
+    """
+    task = episodes[keys.TASK_ID].squeeze(-1)
 
     def f1(values: torch.Tensor, rule: tuple[float, int]) -> float:
-        figures = episode_figures(values, episodes, rule)
-        precision, recall = figures["stop_precision"], figures["stop_recall"]
-        return 2 * precision * recall / max(precision + recall, 1e-9)
+        each = []
+        for number in task.unique():
+            figures = episode_figures(values[task == number], episodes[task == number], rule)
+            precision, recall = figures["stop_precision"], figures["stop_recall"]
+            each.append(2 * precision * recall / max(precision + recall, 1e-9))
+        return sum(each) / len(each)
 
-    rules = ((threshold, run) for threshold in (0.5, 0.6, 0.7, 0.8, 0.9, 0.95) for run in (1, 2, 3))
+    rules = ((threshold, run) for threshold in (0.5, 0.6, 0.7, 0.8, 0.9, 0.95) for run in (1, 2, 3, 4))
     return max(rules, key=lambda rule: min(f1(values, rule) for values in scores))
 
 

@@ -16,7 +16,8 @@ def episodes(first_success: list[int]) -> TensorDict:
     time = torch.arange(FRAMES)
     success = torch.stack([(time >= first) if first >= 0 else time < 0 for first in first_success])
     length = torch.full((len(first_success), 1), FRAMES - 1)
-    return TensorDict({"success": success, "length": length}, batch_size=[len(first_success)])
+    task = torch.zeros(len(first_success), 1, dtype=torch.int64)
+    return TensorDict({"success": success, "length": length, keys.TASK_ID: task}, batch_size=[len(first_success)])
 
 
 def test_a_rule_stops_at_the_end_of_the_first_run_above_the_threshold():
@@ -40,6 +41,15 @@ def test_the_rule_must_hold_on_real_and_on_imagined_frames():
     assert choose_rule([real], data)[0] >= 0.9
     threshold, consecutive = choose_rule([real, imagined], data)
     assert threshold >= 0.9 and consecutive > 1
+
+
+def test_a_rare_task_weighs_as_much_as_a_common_one():
+    data = episodes([6] * 20 + [6, -1])
+    data[keys.TASK_ID][20:] = 1
+    scores = torch.zeros(22, FRAMES)
+    scores[:20, 6:] = 0.65
+    scores[20, 6:], scores[21, 3] = 0.97, 0.9
+    assert choose_rule([scores], data) == (0.5, 2)  # not (0.5, 1), which is right 21 times in 22 as well
 
 
 def test_frames_are_drawn_evenly_over_tasks_and_outcomes_and_never_past_the_end():
