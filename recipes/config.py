@@ -41,8 +41,9 @@ class Explore:
     """The policy's own rollouts in the scenes, at several multiples of its trained scale: data for both models."""
 
     episodes_per_task: int = 160
+    """Rounded up to whole waves of ``num_envs`` for each scale factor."""
     scale_factors: tuple[float, ...] = (0.0, 0.5, 1.0, 2.0)
-    """Multiples of the trained Laplace scale; the episodes are shared out equally. 0 is the greedy policy."""
+    """Multiples of the policy's Laplace scale; the episodes are shared out equally. 0 is the greedy policy."""
     num_envs: int = 32
 
 
@@ -98,6 +99,7 @@ class PostTrain:
     minibatch_size: int = 256
     clip_epsilon: float = 0.1
     ratio_level: str = "step"
+    """``step`` (World-Env Eq. 5) or ``chunk``: one ratio for all steps of a chunk."""
     lora_rank: int = 16
     lora_lr: float = 2e-4
     head_lr: float = 2e-4
@@ -129,12 +131,17 @@ class WorldEnvConfig:
     """The whole loop: demonstrations -> SFT -> exploration -> world model -> reflector -> LOOP -> evaluation."""
 
     run_dir: Path = Path("runs/world_env")
+    """Folder of checkpoints, rollouts, metrics and plots; the same command on the same folder continues."""
     seed: int = 0
+    """Of every random choice; demonstrations and initial states stay the same."""
     num_threads: int = 2
+    """CPU threads. Beside other jobs 1 is faster: threads that wait for a busy core make all wait."""
     tasks: tuple[str, ...] = GOAL_TASKS
+    """``suite/name``, each once."""
     image_size: int = 64
     chunk_length: int = 8
     max_steps: int = 64
+    """Env steps (20 Hz) of an episode at most, a multiple of ``chunk_length``."""
     scale_floor: tuple[float, float, float] = (0.04, 0.0025, 0.15)
     """Lower bound of the Laplace scale of position, rotation and gripper, in normalised action units.
 

@@ -30,11 +30,39 @@ def check_config(config: WorldEnvConfig) -> None:
     """Fails before any long work starts if a task is unknown, a setting impossible or no GL backend renders."""
     if not config.tasks:
         raise ValueError("tasks is empty: name at least one task, for instance goal/open_the_top_drawer")
-    if config.post_train.env not in ("imagined", "tabletop"):
-        raise ValueError(f"post_train.env must be 'imagined' or 'tabletop', got {config.post_train.env!r}")
+    if len(set(config.tasks)) < len(config.tasks):
+        raise ValueError(f"tasks names a task twice: {', '.join(config.tasks)}")
+    for name, value, known in (
+        ("post_train.env", config.post_train.env, ("imagined", "tabletop")),
+        ("post_train.ratio_level", config.post_train.ratio_level, ("step", "chunk")),
+    ):
+        if value not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    for name, value in (
+        ("num_threads", config.num_threads),
+        ("rounds", config.rounds),
+        ("demonstrate.episodes_per_task", config.demonstrate.episodes_per_task),
+        ("explore.episodes_per_task", config.explore.episodes_per_task),
+        ("explore.num_envs", config.explore.num_envs),
+        ("sft.steps", config.sft.steps),
+        ("world_model.steps", config.world_model.steps),
+        ("post_train.iterations", config.post_train.iterations),
+        ("post_train.groups", config.post_train.groups),
+        ("evaluate.episodes_per_task", config.evaluate.episodes_per_task),
+    ):
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+    if config.post_train.group_size < 2:
+        raise ValueError(f"post_train.group_size must be at least 2, got {config.post_train.group_size}")
+    if not config.explore.scale_factors or min(config.explore.scale_factors) < 0:
+        raise ValueError(
+            f"explore.scale_factors must be one number or more, none negative, got {config.explore.scale_factors}"
+        )
     if not all(floor > 0 for floor in config.scale_floor):
         raise ValueError(f"scale_floor must be positive, got {config.scale_floor}")
-    if config.max_steps % config.chunk_length:
+    if config.image_size < 32 or config.image_size % 16:
+        raise ValueError(f"image_size must be a multiple of 16 px and at least 32, got {config.image_size}")
+    if config.max_steps < 1 or config.max_steps % config.chunk_length:
         raise ValueError(f"max_steps must be a multiple of chunk_length={config.chunk_length}, got {config.max_steps}")
     for task in config.tasks:
         load_task(task)

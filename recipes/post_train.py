@@ -101,7 +101,7 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
         if iteration in (0, settings.iterations - 1):
             with RolloutWriter(
                 folder.rollouts(f"{target}_{iteration:03d}"),
-                metadata={"stage": target, "seed": config.seed},
+                metadata={"stage": target, "tasks": list(config.tasks), "seed": config.seed},
                 overwrite=True,
             ) as writer:
                 writer.write(wave)

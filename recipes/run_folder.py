@@ -93,6 +93,10 @@ class RunFolder:
     def done(self, stage: str) -> bool:
         return (self.path / "stages" / stage).exists()
 
+    def forget(self, stage: str) -> None:
+        """Lets a finished stage run again."""
+        (self.path / "stages" / stage).unlink(missing_ok=True)
+
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Runs a stage: forgets the metrics an earlier, unfinished attempt left, and marks it finished at the end."""

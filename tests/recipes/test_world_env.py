@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
+import signal
 
 import pytest
 import torch
@@ -11,7 +13,7 @@ from config import GOAL_TASKS, PRESETS, Demonstrate, Evaluate, Explore, PostTrai
 from config import SFT as SFTConfig
 from parts import check_config
 from run_folder import RunFolder
-from world_env import parse, run_all, stages
+from world_env import parse, run_all, run_single, stages
 from worldenv_trl import keys
 from worldenv_trl.record import read_rollouts
 
@@ -52,6 +54,14 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"max_steps": 20}, "multiple of chunk_length=8, got 20"),
         ({"post_train": PostTrain(env="robot")}, "'robot'"),
         ({"image_size": 8}, "image_size"),
+        ({"image_size": 50}, "multiple of 16 px"),
+        ({"tasks": GOAL_TASKS[:1] * 2}, "names a task twice"),
+        ({"rounds": 0}, "rounds must be at least 1, got 0"),
+        ({"num_threads": 0}, "num_threads must be at least 1"),
+        ({"demonstrate": Demonstrate(episodes_per_task=0)}, "demonstrate.episodes_per_task must be at least 1"),
+        ({"explore": Explore(scale_factors=())}, "explore.scale_factors"),
+        ({"post_train": PostTrain(ratio_level="foo")}, "ratio_level must be one of step, chunk, got 'foo'"),
+        ({"post_train": PostTrain(group_size=1)}, "group_size must be at least 2"),
     ],
 )
 def test_bad_settings_fail_before_any_work_starts(change, message):
@@ -81,4 +91,28 @@ def test_the_whole_loop_runs_writes_its_files_and_continues_where_it_stopped(tin
     run_all(tiny)
     assert "post_train: finished, skipped" in capsys.readouterr().out
     assert folder.checkpoint("post_train").joinpath("model.safetensors").stat().st_mtime_ns == before
+
+    # A lost output, or an earlier stage that ran again, makes a stage unfinished.
+    shutil.rmtree(folder.checkpoint("reflector"))
+    monkeypatch.setattr("sys.argv", ["demonstrate.py"])
+    monkeypatch.setattr("world_env.parse", lambda _: tiny)
+    run_single("train_world_model")
+    run_all(tiny)
+    printed = capsys.readouterr().out
+    assert "explore: finished, skipped" in printed and "world_model: finished, skipped" in printed
+    assert "reflector: finished" not in printed and "post_train: finished" not in printed
     torch.set_num_threads(threads)
+
+
+def test_an_interrupt_ends_with_one_line_even_if_a_library_turns_it_into_an_error(tiny, monkeypatch):
+    def struck(*_):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as error:
+            raise RuntimeError("converting a tensordict to boolean") from error
+
+    monkeypatch.setattr("demonstrate.run", struck)
+    with pytest.raises(SystemExit, match="interrupted in stage demonstrate: the same command continues"):
+        run_all(tiny)
+    assert not RunFolder(tiny.run_dir).done("demonstrate")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -142,7 +142,12 @@ class LOOPLoss(LossModule):
         steps = self._executed(tensordict)  # [*B, C]
         if steps.shape != chunk.shape[:-1]:
             raise ValueError(f"{names.step_mask} must be {list(chunk.shape[:-1])}, got {list(steps.shape)}")
-        advantage = tensordict.get(names.advantage)
+        advantage = tensordict.get(names.advantage, None)
+        if advantage is None:
+            raise ValueError(
+                f"the tensordict holds no {names.advantage!r} {[*steps.shape[:-1], 1]}: expand rloo_advantage over "
+                "the decisions of each rollout"
+            )
         if advantage.shape != (*steps.shape[:-1], 1):
             raise ValueError(f"{names.advantage} must be {[*steps.shape[:-1], 1]}, got {list(advantage.shape)}")
 
