@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +106,7 @@ def _evaluation(lines: list[dict[str, Any]]) -> Any:
             axes.bar([i + 0.4 * offset for i in range(len(rows))], heights, 0.38, yerr=spans, capsize=3, label=policy)
         axes.set_xticks(
             [i + 0.2 for i in range(len(tasks))],
-            [task.split("/")[-1].replace("_", "\n", 2) for task in tasks],
+            [textwrap.fill(task.split("/")[-1].replace("_", " "), 14) for task in tasks],
             fontsize=7,
         )
         axes.set(title=f"held-out success, {protocol} stops", ylim=(0, 1))
