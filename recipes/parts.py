@@ -141,6 +141,7 @@ def exploring_actor(config: WorldEnvConfig, policy: OFTPolicy, scale_factor: flo
     """The stochastic actor of exploration and LOOP, its scale bounded below."""
     position, rotation, gripper = (math.log(floor) for floor in config.scale_floor)
     low = (*3 * [position], *3 * [rotation], gripper)
+    # The upper bound stays above every floor, whatever the floors are set to.
     return laplace_actor(policy, scale_factor=scale_factor, log_scale_bounds=(low, max(-1.5, *(x + 1 for x in low))))
 
 
