@@ -128,6 +128,14 @@ def test_more_groups_than_contexts_repeat_them_evenly():
     assert sorted(ids.count(i) for i in (100, 101, 102)) == [2, 2, 3]
 
 
+def test_the_tasks_take_turns_in_every_draw():
+    env = make_env(groups=2, count=6)
+    drawn = [env.reset() for _ in range(6)]
+    assert all(sorted(td[TASK_ID][:, 0, 0].tolist()) == [0, 1] for td in drawn)
+    flat = [index for td in drawn for index in td[CONTEXT_ID][:, 0, 0].tolist()]
+    assert flat[:6] != flat[6:] and sorted(flat[:6]) == sorted(flat[6:]) == list(range(100, 106))
+
+
 def test_the_seed_decides_contexts_and_noise():
     def wave(seed):
         env = make_env(seed=seed)

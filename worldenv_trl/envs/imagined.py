@@ -65,8 +65,8 @@ class ImaginedEnv(EnvBase):
         seed: of the contexts' order and of the noise; drawn from torch's generator when None.
         device: of the specs and buffers; the contexts' when None.
 
-    A reset of a whole group draws its next context, without replacement while that is possible; rows reset while others
-    of their group are running restart their context, so that a group never mixes contexts.
+    A reset of a whole group draws its next context, the tasks in turn and without replacement while that is possible;
+    rows reset while others of their group are running restart their context, so that a group never mixes contexts.
     ``reset(td, set_state=True)`` starts from the contexts in ``td`` [G, N], always with the same noise.
     """
 
@@ -179,14 +179,25 @@ class ImaginedEnv(EnvBase):
     # ------------------------------------------------------------------------------------------------- reset
 
     def _draw(self, count: int) -> list[int]:
-        """The next ``count`` contexts: permutation after permutation, no context twice in a draw if it can be."""
+        """The next ``count`` contexts, the tasks in turn: no context twice in a draw if it can be."""
         drawn: list[int] = []
         while len(drawn) < count:
             if not self._queue:
-                order = torch.randperm(len(self._contexts), generator=self._generator).tolist()
+                order = self._order()
                 self._queue = [i for i in order if i not in drawn] + [i for i in order if i in drawn]
             drawn.append(self._queue.pop(0))
         return drawn
+
+    def _order(self) -> list[int]:
+        """All contexts, shuffled within their task, the tasks taking turns."""
+        shuffled = torch.randperm(len(self._contexts), generator=self._generator).tolist()
+        tasks = self._contexts[TASK_ID].flatten().tolist()
+        turn: dict[int, int] = {}
+        turns = []
+        for index in shuffled:
+            turns.append(turn.get(tasks[index], 0))
+            turn[tasks[index]] = turns[-1] + 1
+        return [index for _, index in sorted(zip(turns, shuffled, strict=True), key=lambda pair: pair[0])]
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDictBase:
         groups, rollouts = self.batch_size
