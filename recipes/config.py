@@ -147,6 +147,9 @@ class WorldEnvConfig:
 
     The scale head learns what is left on the demonstrations, a few hundredths of what the policy is off elsewhere:
     without a floor the rollouts of a group all end alike and LOOP learns nothing."""
+    train_states: int = 50
+    """Training initial states of each task that exploration starts from, and LOOP after it. 50 is the standard; another
+    one costs a rollout of exploration, no demonstration."""
     rounds: int = 1
     """Times that exploration, both models and LOOP run in turn, each with the policy reached so far."""
     demonstrate: Demonstrate = field(default_factory=Demonstrate)

@@ -23,17 +23,12 @@ def run(config: WorldEnvConfig, folder: RunFolder, policy: str = "sft", target: 
     per_scale = -(-settings.episodes_per_task * len(config.tasks) // len(settings.scale_factors))
     waves = -(-per_scale // settings.num_envs)
     metadata = {"stage": target, "tasks": list(config.tasks), "seed": config.seed, "policy": policy}
+    # After success the rollout goes on: the models must see what undoes it (World-Env Figure 6).
+    env = step_env(
+        config, "train", settings.num_envs, terminate_on_success=False, seed=config.seed + 1000 * len(target)
+    )
     with RolloutWriter(folder.rollouts(target), metadata=metadata, overwrite=True) as writer:
-        for number, factor in enumerate(settings.scale_factors):
-            # After success the rollout goes on: the models must see what undoes it (World-Env Figure 6).
-            env = step_env(
-                config,
-                "train",
-                settings.num_envs,
-                init_state_mode="random",
-                terminate_on_success=False,
-                seed=config.seed + 1000 * number + 17 * len(target),
-            )
+        for factor in settings.scale_factors:
             player = chunk_player(exploring_actor(config, model, max(factor, 1e-6)), config.chunk_length)
             collector = GroupCollector(
                 env,
@@ -50,10 +45,11 @@ def run(config: WorldEnvConfig, folder: RunFolder, policy: str = "sft", target: 
                 reached.append(
                     (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1).float().mean().item()
                 )
-            collector.shutdown()
+            collector.shutdown(close_env=False)
             folder.log(
                 target, scale_factor=factor, episodes=waves * settings.num_envs, success=sum(reached) / len(reached)
             )
+    env.close()
 
 
 if __name__ == "__main__":

@@ -20,8 +20,6 @@ from worldenv_trl.reflectors import CompactReflector
 from worldenv_trl.scenes import load_task
 from worldenv_trl.world_models import VideoWorldModel
 
-TRAIN_CONTEXTS = 50  # the standard protocol's training initial states
-
 
 def physics_outcomes(
     config: WorldEnvConfig,
@@ -58,7 +56,7 @@ def physics_outcomes(
         terminate_on_success=reflector is None,
     )
     if reflector is not None:
-        env = TransformedEnv(env, stopping_rule(reflector))
+        env = TransformedEnv(env, stopping_rule(reflector, real=True))
     waves = -(-episodes // num_envs)
     collector = GroupCollector(
         chunked(env, config.chunk_length),
@@ -109,15 +107,19 @@ def greedy_outcomes(
     contexts: TensorDict,
     per_task: int,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Greedy success on up to ``per_task`` training contexts of every task: ``(real, imagined)``, bool ``[K]``."""
+    """Greedy success on up to ``per_task`` training contexts of every task: ``(real, imagined)``, bool ``[K]``.
+
+    They are spread over all contexts: the first ones are the demonstrations' own.
+    """
     numbers = contexts[keys.CONTEXT_ID].squeeze(-1)
     chosen, real = [], []
     for task in config.tasks:
         first = context_id(load_task(task).task_id, "train", 0)
-        rows = ((numbers >= first) & (numbers < first + TRAIN_CONTEXTS)).nonzero().squeeze(-1)[:per_task]
+        rows = ((numbers >= first) & (numbers < first + config.train_states)).nonzero().squeeze(-1)
         if len(rows):
+            rows = rows[torch.linspace(0, len(rows) - 1, min(per_task, len(rows))).long()]
             indices = (numbers[rows] - first).tolist()
-            outcome = physics_outcomes(config, actor, task, "train", TRAIN_CONTEXTS, indices=indices)
+            outcome = physics_outcomes(config, actor, task, "train", len(indices), indices=indices)
             chosen.append(rows)
             real.append(outcome)
     chosen = torch.cat(chosen)

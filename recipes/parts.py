@@ -41,6 +41,7 @@ def check_config(config: WorldEnvConfig) -> None:
     for name, value in (
         ("num_threads", config.num_threads),
         ("rounds", config.rounds),
+        ("train_states", config.train_states),
         ("demonstrate.episodes_per_task", config.demonstrate.episodes_per_task),
         ("explore.episodes_per_task", config.explore.episodes_per_task),
         ("explore.num_envs", config.explore.num_envs),
@@ -88,7 +89,7 @@ def step_env(
 def physics_waves_env(config: WorldEnvConfig, groups: int, group_size: int) -> EnvBase:
     """Physics, one chunk a step, rows in groups that share an initial state: LOOP's upper bound."""
     return chunked(
-        tabletop(config, "train", groups * group_size, None, init_state_mode="random", group_repeats=group_size),
+        tabletop(config, "train", groups * group_size, None, group_repeats=group_size),
         config.chunk_length,
     )
 
@@ -96,6 +97,8 @@ def physics_waves_env(config: WorldEnvConfig, groups: int, group_size: int) -> E
 def tabletop(config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[str] | None, **options) -> TabletopEnv:
     tasks = list(config.tasks if tasks is None else tasks)
     options = {"seed": config.seed, "num_threads": config.num_threads, "proprio": PROPRIO} | options
+    if split == "train":
+        options = {"init_state_count": config.train_states} | options
     return TabletopEnv(
         tasks if len(tasks) > 1 else tasks[0],
         num_envs=num_envs,
@@ -127,9 +130,12 @@ def imagined_env(
     return TransformedEnv(env, stopping_rule(reflector))
 
 
-def stopping_rule(reflector: CompactReflector) -> Reflect:
-    """The stopping rule that was chosen when the reflector was trained is stored with it."""
-    return Reflect(reflector, threshold=reflector.config.threshold, consecutive=reflector.config.consecutive)
+def stopping_rule(reflector: CompactReflector, *, real: bool = False) -> Reflect:
+    """The stopping rules that were chosen when the reflector was trained, for imagined and for ``real`` frames."""
+    config = reflector.config
+    if real:
+        return Reflect(reflector, threshold=config.real_threshold, consecutive=config.real_consecutive)
+    return Reflect(reflector, threshold=config.threshold, consecutive=config.consecutive)
 
 
 def chunk_player(actor, chunk_length: int) -> MultiStepActorWrapper:

@@ -161,7 +161,8 @@ def _probe(config, actor, imagination) -> dict[str, float]:
     """Greedy success on training contexts: in the physics (the reflector not involved) and in imagination."""
     count = config.post_train.probe_contexts
     if imagination is None:
-        real = [physics_outcomes(config, actor, task, "train", count) for task in config.tasks]
+        indices = torch.linspace(0, config.train_states - 1, min(count, config.train_states)).long().tolist()
+        real = [physics_outcomes(config, actor, task, "train", len(indices), indices=indices) for task in config.tasks]
         return {"real_success": torch.cat(real).float().mean().item()}
     real, imagined = greedy_outcomes(config, actor, *imagination, count)
     report = honesty(imagined.bool(), real.bool())

@@ -11,10 +11,11 @@ import torch
 
 from config import GOAL_TASKS, PRESETS, Demonstrate, Evaluate, Explore, PostTrain, Reflector, WorldModel
 from config import SFT as SFTConfig
-from parts import check_config
+from parts import check_config, read_contexts
 from run_folder import RunFolder
 from world_env import parse, run_all, run_single, stages
 from worldenv_trl import keys
+from worldenv_trl.envs import context_id
 from worldenv_trl.record import read_rollouts
 
 
@@ -26,6 +27,7 @@ def tiny(tmp_path):
         num_threads=1,
         tasks=GOAL_TASKS[1:2],
         max_steps=16,
+        train_states=4,
         demonstrate=Demonstrate(episodes_per_task=1),
         sft=SFTConfig(steps=3, scale_steps=2),
         explore=Explore(episodes_per_task=8, num_envs=4, scale_factors=(1.0,)),
@@ -57,6 +59,7 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"image_size": 50}, "multiple of 16 px"),
         ({"tasks": GOAL_TASKS[:1] * 2}, "names a task twice"),
         ({"rounds": 0}, "rounds must be at least 1, got 0"),
+        ({"train_states": 0}, "train_states must be at least 1, got 0"),
         ({"num_threads": 0}, "num_threads must be at least 1"),
         ({"demonstrate": Demonstrate(episodes_per_task=0)}, "demonstrate.episodes_per_task must be at least 1"),
         ({"explore": Explore(scale_factors=())}, "explore.scale_factors"),
@@ -82,6 +85,8 @@ def test_the_whole_loop_runs_writes_its_files_and_continues_where_it_stopped(tin
         "post_train",
     }
     assert all((tiny.run_dir / "plots" / f"{name}.png").exists() for name in ("losses", "evaluation"))
+    contexts = read_contexts(folder)[keys.CONTEXT_ID].flatten().tolist()
+    assert contexts == [context_id(1, "train", index) for index in range(4)]  # exploration visits every one
     wave = read_rollouts(folder.rollouts("post_train_000"))
     assert wave[keys.CHUNK].shape[-2:] == (8, 7)
     assert "physics" in capsys.readouterr().out

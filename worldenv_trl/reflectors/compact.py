@@ -18,7 +18,7 @@ _FRAMES_PER_CALL = 64
 
 @dataclass(frozen=True)
 class CompactReflectorConfig:
-    """Sizes of a :class:`CompactReflector`, and the stopping rule that was chosen for it.
+    """Sizes of a :class:`CompactReflector`, and the stopping rules that were chosen for it.
 
     Args:
         num_tasks: ``task_id`` runs from 0 to ``num_tasks - 1``.
@@ -27,7 +27,8 @@ class CompactReflectorConfig:
         feature_dim: length of a frame's feature.
         hidden_dim: of the reward head.
         num_frames: most frames of a prefix that are looked at.
-        threshold, consecutive: when a rollout is stopped, see :class:`~worldenv_trl.envs.Reflect`.
+        threshold, consecutive: when an imagined rollout is stopped, see :class:`~worldenv_trl.envs.Reflect`.
+        real_threshold, real_consecutive: the same in front of a camera, whose frames are sharper than imagined ones.
     """
 
     num_tasks: int
@@ -38,6 +39,8 @@ class CompactReflectorConfig:
     num_frames: int = 32
     threshold: float = 0.5
     consecutive: int = 1
+    real_threshold: float = 0.5
+    real_consecutive: int = 1
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", tuple(self.widths))
@@ -47,10 +50,14 @@ class CompactReflectorConfig:
             raise ValueError(f"image_size must be a multiple of 8 px and at least 16, got {self.image_size}")
         if self.num_frames < 2:
             raise ValueError(f"num_frames must be at least 2, the first and the last frame, got {self.num_frames}")
-        if not 0 < self.threshold < 1 or self.consecutive < 1:
-            raise ValueError(
-                f"threshold must be in (0, 1) and consecutive at least 1, got {self.threshold} and {self.consecutive}"
-            )
+        for threshold, consecutive in (
+            (self.threshold, self.consecutive),
+            (self.real_threshold, self.real_consecutive),
+        ):
+            if not 0 < threshold < 1 or consecutive < 1:
+                raise ValueError(
+                    f"threshold must be in (0, 1) and consecutive at least 1, got {threshold} and {consecutive}"
+                )
 
 
 class CompactReflector(Reflector, Pretrained):
