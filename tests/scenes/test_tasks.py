@@ -105,7 +105,7 @@ def test_the_middle_of_everything_is_inside_the_picture(name):
     for placement in task.placements:
         place = scene.xpos[:, scene.model.body(f"{placement.name}/").id]
         pixels = task.camera("agentview").project(place, 64)
-        assert pixels.min() > 7 and pixels.max() < 57
+        assert pixels.min() > 8 and pixels.max() < 56
 
 
 def test_the_camera_spends_a_pixel_on_nine_millimetres_or_less_across_the_scene():

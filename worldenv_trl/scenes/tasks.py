@@ -118,7 +118,7 @@ _TASKS: tuple[Task, ...] = (
     ),
     _goal_task(
         2, "turn_on_the_stove", "turn on the stove", ("TurnOn", "stove"),
-        (Placement("stove", Stove, (0.035, 0.02), (0.110, 0.090), fixture=True, radius=0.18),),
+        (Placement("stove", Stove, (0.030, 0.02), (0.110, 0.090), fixture=True, radius=0.18),),
     ),
 )  # fmt: skip
 
