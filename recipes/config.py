@@ -181,7 +181,7 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
             train_states=150,
             rounds=2,
             reflector=Reflector(choose_threshold=True),
-            post_train=PostTrain(iterations=48),
+            post_train=PostTrain(iterations=56),
         ),
     ),
 }
