@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
+
+# TorchRL deprecates classes of its own when its collectors are imported; every recipe imports this module first.
+warnings.filterwarnings("ignore", message="Creating .*WeightUpdater")
 
 GOAL_TASKS = (
     "goal/put_the_bowl_on_the_plate",

@@ -6,6 +6,7 @@ Alone: ``python recipes/sft.py improve --run-dir runs/improve``.
 from __future__ import annotations
 
 import math
+import warnings
 
 import torch
 from torchrl.objectives import BCLoss
@@ -52,7 +53,9 @@ def run(config: WorldEnvConfig, folder: RunFolder) -> None:
 
 
 def _behaviour_cloning(actor, **options) -> BCLoss:
-    loss = BCLoss(actor, **options)
+    with warnings.catch_warnings():  # about its own annotations
+        warnings.simplefilter("ignore", UserWarning)
+        loss = BCLoss(actor, **options)
     loss.set_keys(action=keys.CHUNK, pad_mask=keys.ACTION_IS_PAD)
     return loss
 

@@ -137,9 +137,13 @@ def parse(arguments: Sequence[str]) -> WorldEnvConfig:
 
 
 def _open(config: WorldEnvConfig) -> RunFolder:
-    check_config(config)
-    folder = RunFolder(config.run_dir)
-    folder.open(config)
+    """The run folder of checked settings; what is wrong with them is said in one line."""
+    try:
+        check_config(config)
+        folder = RunFolder(config.run_dir)
+        folder.open(config)
+    except (ValueError, OSError, RuntimeError) as error:
+        raise SystemExit(f"error: {error}") from error
     torch.set_num_threads(config.num_threads)
     return folder
 

@@ -326,6 +326,10 @@ def test_unusable_settings_are_refused():
     for size in ([4], [2, 0], [1, 2, 3]):
         with pytest.raises(ValueError, match="batch_size"):
             ImaginedEnv(CountingWorldModel(), FK, contexts, size, max_steps=C)
+    world_model = CountingWorldModel()
+    world_model.image_size = 2 * SIZE
+    with pytest.raises(ValueError, match=f"frames of {2 * SIZE} px, the contexts' images are"):
+        ImaginedEnv(world_model, FK, contexts, [1, 1], max_steps=C, chunk_length=C)
     with pytest.raises(ValueError, match="proprio"):
         make_env(proprio="true")
     with pytest.raises(ValueError, match="max_steps"):

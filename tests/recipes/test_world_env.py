@@ -72,6 +72,12 @@ def test_bad_settings_fail_before_any_work_starts(change, message):
         check_config(dataclasses.replace(PRESETS["smoke"][1], **change))
 
 
+def test_the_command_names_a_bad_setting_in_one_line(tiny):
+    with pytest.raises(SystemExit, match="error: unknown task 'goal/close_the_door'"):
+        run_all(dataclasses.replace(tiny, tasks=("goal/close_the_door",)))
+    assert not tiny.run_dir.exists()
+
+
 def test_the_whole_loop_runs_writes_its_files_and_continues_where_it_stopped(tiny, capsys, monkeypatch):
     monkeypatch.setattr("demonstrate.check_solved", lambda *_: None)  # 16 steps are too few for the expert
     threads = torch.get_num_threads()

@@ -35,7 +35,7 @@ def chunked(env: EnvBase, chunk_length: int = CHUNK_LENGTH, *, frames: bool = Fa
     With ``frames`` it writes what :class:`~worldenv_trl.envs.ImaginedEnv` writes, under the same keys; a
     :class:`~worldenv_trl.envs.Reflect` goes around ``env`` first, so that it can stop inside a chunk.
     """
-    return TransformedEnv(env, ChunkedActions(chunk_length, frames=frames))
+    return TransformedEnv(env, ChunkedActions(chunk_length, frames=frames), auto_unwrap=True)
 
 
 class ChunkedActions(MultiAction):

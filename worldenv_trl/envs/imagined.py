@@ -96,6 +96,9 @@ class ImaginedEnv(EnvBase):
         trained_for = getattr(world_model, "chunk_length", chunk_length)
         if trained_for != chunk_length:
             raise ValueError(f"the world model paints chunks of {trained_for} frames, chunk_length is {chunk_length}")
+        side, image = getattr(world_model, "image_size", None), tuple(contexts[IMAGE].shape[-2:])
+        if side is not None and image != (side, side):
+            raise ValueError(f"the world model paints frames of {side} px, the contexts' images are {image}")
         device = torch.device(device or contexts.device or "cpu")
         super().__init__(device=device, batch_size=batch)
 

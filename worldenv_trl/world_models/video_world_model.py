@@ -152,6 +152,10 @@ class VideoWorldModel(TensorDictModuleBase, Pretrained):
         return self.config.chunk_length
 
     @property
+    def image_size(self) -> int:
+        return self.config.image_size
+
+    @property
     def memory_frames(self) -> int:
         """M."""
         return _MEMORY
