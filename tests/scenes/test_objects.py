@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from worldenv_trl.scenes import SceneBatch, load_task
-from worldenv_trl.scenes.objects import Bowl, Cabinet, Plate, Stove
+from worldenv_trl.scenes.entities.cookware import Stove
+from worldenv_trl.scenes.entities.storage import Cabinet
+from worldenv_trl.scenes.entities.tableware import Bowl, Plate
 
 BOWL, DRAWER, STOVE = "goal/put_the_bowl_on_the_plate", "goal/open_the_top_drawer", "goal/turn_on_the_stove"
 GRIP = Bowl.HEIGHT - 0.022

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from worldenv_trl.scenes import SceneBatch, list_suites, list_tasks, load_task, tasks
-from worldenv_trl.scenes.objects import Stove
+from worldenv_trl.scenes.entities.cookware import Stove
 
 NAMES = list_tasks("goal")
 

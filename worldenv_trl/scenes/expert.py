@@ -13,7 +13,9 @@ import numpy as np
 
 from worldenv_trl.keys import ACTION_DIM, POSITION_STEP, ROTATION_STEP
 from worldenv_trl.scenes import controller, predicates
-from worldenv_trl.scenes.objects import Bowl, Cabinet, Plate, Stove
+from worldenv_trl.scenes.entities.cookware import Stove
+from worldenv_trl.scenes.entities.storage import Cabinet
+from worldenv_trl.scenes.entities.tableware import Bowl, Plate
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.simulation import SceneBatch

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldenv_trl.scenes.objects import Bowl, Cabinet, Plate, Stove
+from worldenv_trl.scenes.entities.cookware import Stove
+from worldenv_trl.scenes.entities.storage import Cabinet
+from worldenv_trl.scenes.entities.tableware import Bowl, Plate
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.simulation import SceneBatch

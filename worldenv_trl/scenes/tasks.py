@@ -16,7 +16,9 @@ from mujoco.batch import Batch
 from worldenv_trl.scenes import panda, predicates
 from worldenv_trl.scenes.arena import AGENTVIEW, TabletopArena
 from worldenv_trl.scenes.camera import Camera
-from worldenv_trl.scenes.objects import Bowl, Cabinet, Plate, Stove
+from worldenv_trl.scenes.entities.cookware import Stove
+from worldenv_trl.scenes.entities.storage import Cabinet
+from worldenv_trl.scenes.entities.tableware import Bowl, Plate
 from worldenv_trl.scenes.simulation import home_state
 
 if TYPE_CHECKING:

@@ -1,0 +1,6 @@
+"""Objects and fixtures, composed of primitives: no mesh, no texture, no download."""
+
+from worldenv_trl.scenes.entities.base import JointState, Primitive, Region
+from worldenv_trl.scenes.entities.registry import CATEGORIES, Category, make_entity
+
+__all__ = ["CATEGORIES", "Category", "JointState", "Primitive", "Region", "make_entity"]
