@@ -122,8 +122,9 @@ def test_an_interrupt_ends_with_one_line_even_if_a_library_turns_it_into_an_erro
         except KeyboardInterrupt as error:
             raise RuntimeError("converting a tensordict to boolean") from error
 
+    before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr("demonstrate.run", struck)
     with pytest.raises(SystemExit, match="interrupted in stage demonstrate: the same command continues"):
         run_all(tiny)
     assert not RunFolder(tiny.run_dir).done("demonstrate")
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before
