@@ -210,18 +210,21 @@ def episode_figures(
 
 
 def choose_rule(scores: torch.Tensor, episodes: TensorDict, late: int = 0) -> tuple[float, int]:
-    """Threshold and consecutive frames with the best F1 of stopping, averaged over tasks."""
+    """Threshold and consecutive frames with the best F0.5 of stopping, averaged over tasks.
+
+    Precision counts twice: LOOP learns whatever stops a rollout, wrong stops first of all.
+    """
     task = episodes[keys.TASK_ID].squeeze(-1)
 
-    def f1(rule: tuple[float, int]) -> float:
+    def f_half(rule: tuple[float, int]) -> float:
         each = []
         for number in task.unique():
             figures = episode_figures(scores[task == number], episodes[task == number], rule, late)
             precision, recall = figures["stop_precision"], figures["stop_recall"]
-            each.append(2 * precision * recall / max(precision + recall, 1e-9))
+            each.append(1.25 * precision * recall / max(0.25 * precision + recall, 1e-9))
         return sum(each) / len(each)
 
-    return max(((threshold, run) for threshold in (0.5, 0.6, 0.7, 0.8, 0.9, 0.95) for run in (1, 2, 3, 4)), key=f1)
+    return max(((threshold, run) for threshold in (0.5, 0.6, 0.7, 0.8, 0.9, 0.95) for run in (1, 2, 3, 4)), key=f_half)
 
 
 if __name__ == "__main__":

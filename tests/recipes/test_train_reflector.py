@@ -49,6 +49,14 @@ def test_the_rule_with_the_fewest_wrong_stops_is_chosen():
     assert choose_rule(doubtful, data)[0] >= 0.9
 
 
+def test_a_wrong_stop_costs_more_than_a_missed_one():
+    data = episodes([6] * 10 + [-1] * 4)
+    scores = torch.zeros(14, FRAMES)
+    scores[:7, 6:] = 0.97  # above 0.9, seven of ten are found; above 0.5 all of them, and three that are none
+    scores[7:10, 6:], scores[10:13, 6:] = 0.7, 0.7
+    assert choose_rule(scores, data)[0] >= 0.7
+
+
 def test_a_rare_task_weighs_as_much_as_a_common_one():
     data = episodes([6] * 20 + [6, -1])
     data[keys.TASK_ID][20:] = 1
