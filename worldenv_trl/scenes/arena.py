@@ -6,6 +6,7 @@ from dm_control import composer, mjcf
 
 from worldenv_trl.scenes import panda
 from worldenv_trl.scenes.camera import Camera, look_at
+from worldenv_trl.scenes.entities.base import Color
 
 AGENTVIEW = look_at("agentview", (0.78, 0.0, 0.60), (-0.03, 0.0, 0.105), 31.0)
 
@@ -17,7 +18,13 @@ class TabletopArena:
     restores it (LIBERO's initial states do not).
     """
 
-    def __init__(self, cameras: tuple[Camera, ...] = (AGENTVIEW,)) -> None:
+    def __init__(
+        self,
+        cameras: tuple[Camera, ...] = (AGENTVIEW,),
+        *,
+        table: Color = (0.72, 0.70, 0.66, 1),
+        wall: Color = (0.45, 0.52, 0.50, 1),
+    ) -> None:
         self.root = root = mjcf.RootElement(model="scene")
         root.compiler.angle = "radian"
         root.option.set_attributes(timestep=panda.TIMESTEP, integrator="implicitfast", cone="elliptic", impratio=10)
@@ -36,7 +43,7 @@ class TabletopArena:
             diffuse=(0.35, 0.35, 0.35),
         )
         root.worldbody.add(
-            "geom", name="table", type="box", pos=(0, 0, -0.02), size=(0.5, 0.7, 0.02), rgba=(0.72, 0.70, 0.66, 1),
+            "geom", name="table", type="box", pos=(0, 0, -0.02), size=(0.5, 0.7, 0.02), rgba=table,
             friction=(1.0, 0.01, 0.0005), condim=4,
         )  # fmt: skip
         root.worldbody.add(
@@ -45,7 +52,7 @@ class TabletopArena:
             type="box",
             pos=(-1.2, 0, 0),
             size=(0.02, 3, 3),
-            rgba=(0.45, 0.52, 0.50, 1),
+            rgba=wall,
             contype=0,
             conaffinity=0,
         )

@@ -45,13 +45,20 @@ class Primitive(composer.Entity):
 
     Attributes:
         radius: horizontal radius that is kept free of other things when an initial state is drawn.
+        footprint: half sizes along x and y that are kept free instead, of things that are not round.
         height: of its highest point at rest.
+        surface: height of what stands on it.
         regions: by name, see :class:`Region`; each is a box site of that name.
         states: ``(predicate, part)`` to :class:`JointState`; the part is a region's name, or empty for the whole.
     """
 
     radius: float = 0.05
+    footprint: tuple[float, float] | None = None
     height: float = 0.05
+
+    @property
+    def surface(self) -> float:
+        return self.height
 
     def _build(self, name: str, **shape: object) -> None:
         self._root = mjcf.RootElement(model=name)

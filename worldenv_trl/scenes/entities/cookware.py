@@ -13,6 +13,7 @@ class FryingPan(Primitive):
     """A pan, 0.17 m across, with a long handle towards +y; graspable by the handle."""
 
     radius, height = 0.13, 0.035
+    footprint = (0.085, 0.21)
     HANDLE = (0.0, 0.155, 0.030)
 
     def _shape(self, body: mjcf.Element) -> None:
@@ -55,6 +56,7 @@ class Stove(Primitive):
     START_ANGLE = -math.pi / 2  # direction of the lever (from +x) when off
     BURNER = (0.075, 0.0)
     radius, height = 0.18, 0.085
+    footprint = (0.14, 0.12)
 
     def _shape(self, body: mjcf.Element) -> None:
         self._box(body, (0, 0, 0.0125), (0.14, 0.12, 0.0125), rgba=(0.78, 0.80, 0.83, 1))

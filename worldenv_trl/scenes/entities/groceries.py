@@ -39,6 +39,7 @@ class Packet(Primitive):
     ) -> None:
         depth, length, height = size
         self.radius, self.height = 0.5 * (depth**2 + length**2) ** 0.5, height
+        self.footprint = (depth / 2, length / 2)
         self._box(body, (0, 0, height / 2), (depth / 2, length / 2, height / 2), mass=mass, rgba=color)
         self._box(
             body, (0, 0, height / 2), (depth / 2 + 0.0006, 0.18 * length, height / 2 + 0.0006), **GHOST, rgba=stripe
@@ -51,6 +52,7 @@ class Carton(Primitive):
 
     HALF = 0.030
     radius, height = 0.045, 0.135
+    footprint = (HALF, HALF)
 
     def _shape(self, body: mjcf.Element, color: Color = WHITE, label: Color = (0.1, 0.35, 0.85, 1)) -> None:
         half, shoulder = self.HALF, 0.110
@@ -91,6 +93,7 @@ class Book(Primitive):
 
     THICKNESS, WIDTH = 0.030, 0.090
     radius, height = 0.05, 0.130
+    footprint = (THICKNESS / 2, WIDTH / 2)
 
     def _shape(self, body: mjcf.Element, cover: Color = (0.10, 0.10, 0.13, 1)) -> None:
         half = (self.THICKNESS / 2, self.WIDTH / 2, self.height / 2)

@@ -40,10 +40,10 @@ CATEGORIES: Mapping[str, Category] = MappingProxyType(
     {
         # tableware
         "bowl": _as(Bowl),
-        "akita_black_bowl": _as(Bowl, outside=(0.22, 0.22, 0.25, 1), inside=(0.52, 0.10, 0.08, 1)),
+        "akita_black_bowl": _as(Bowl, scale=0.80, outside=(0.22, 0.22, 0.25, 1), inside=(0.52, 0.10, 0.08, 1)),
         "white_bowl": _as(Bowl, outside=(0.92, 0.92, 0.93, 1), inside=(0.70, 0.72, 0.76, 1)),
         "red_bowl": _as(Bowl, outside=(0.78, 0.12, 0.10, 1), inside=(0.45, 0.06, 0.05, 1)),
-        "plate": _as(Plate),
+        "plate": _as(Plate, scale=0.72),
         "glazed_rim_porcelain_ramekin": _as(Ramekin),
         "porcelain_mug": _as(Mug),
         "red_coffee_mug": _as(Mug, outside=(0.82, 0.12, 0.10, 1), inside=(0.40, 0.22, 0.12, 1)),
@@ -57,7 +57,7 @@ CATEGORIES: Mapping[str, Category] = MappingProxyType(
             Packet, size=(0.060, 0.075, 0.036), color=(0.33, 0.18, 0.10, 1), stripe=(0.93, 0.85, 0.70, 1)
         ),
         "cookies": _as(
-            Packet, size=(0.120, 0.090, 0.034), color=(0.80, 0.16, 0.14, 1), stripe=(0.95, 0.80, 0.35, 1), mass=0.3
+            Packet, size=(0.100, 0.070, 0.034), color=(0.80, 0.16, 0.14, 1), stripe=(0.95, 0.80, 0.35, 1), mass=0.3
         ),
         "milk": _as(Carton, color=_WHITE, label=(0.10, 0.35, 0.85, 1)),
         "orange_juice": _as(Carton, color=(0.97, 0.92, 0.80, 1), label=(0.98, 0.55, 0.05, 1)),

@@ -24,6 +24,7 @@ class Cabinet(Primitive):
     TRAVEL = (-0.16, 0.0)
     HOLLOW = False  # whether the drawers hold things; walls that collide cost time
     radius, height = 0.15, TOP + 0.004
+    footprint = (WIDTH, DEPTH)
 
     def _shape(
         self,
@@ -87,6 +88,7 @@ class Microwave(Primitive):
     HALF = (0.13, 0.11, 0.085)
     OPEN_BELOW, CLOSED_ABOVE = -1.3, -0.005
     radius, height = 0.19, 0.17
+    footprint = HALF[:2]
 
     def _shape(self, body: mjcf.Element) -> None:
         x, y, z = self.HALF
@@ -122,6 +124,8 @@ class Basket(Primitive):
 
     HALF = (0.13, 0.11)
     radius, height = 0.16, 0.09
+    footprint = HALF
+    surface = 0.008
 
     def _shape(self, body: mjcf.Element) -> None:
         x, y = self.HALF
@@ -137,6 +141,7 @@ class Caddy(Primitive):
     """A desk organiser: a deep compartment at the back, two in the middle, a low one in front (+x)."""
 
     radius, height = 0.15, 0.12
+    footprint = (0.094, 0.124)
 
     def _shape(self, body: mjcf.Element) -> None:
         wood, x, y = {"rgba": (0.80, 0.62, 0.40, 1)}, 0.09, 0.12
@@ -156,6 +161,7 @@ class Rack(Primitive):
     """A wine rack: a slatted deck on four posts, with a low rim."""
 
     radius, height = 0.13, 0.085
+    footprint = (0.079, 0.105)
 
     def _shape(self, body: mjcf.Element) -> None:
         x, y, deck = 0.075, 0.105, 0.062
@@ -175,6 +181,7 @@ class Shelf(Primitive):
     """Two boards between two sides, open to both ends of y."""
 
     radius, height = 0.16, 0.20
+    footprint = (0.125, 0.09)
 
     def _shape(self, body: mjcf.Element) -> None:
         x, y, wood = 0.12, 0.09, {"rgba": (0.66, 0.47, 0.27, 1)}

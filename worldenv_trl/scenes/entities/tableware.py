@@ -17,6 +17,7 @@ class Bowl(Primitive):
     FOOT_RADIUS = 0.054
     HEIGHT = 0.05
     radius, height = 0.065, HEIGHT
+    surface = 0.008
 
     # Green is nobody else's: a dark bowl runs into the dark hand that holds it.
     def _shape(
@@ -24,10 +25,11 @@ class Bowl(Primitive):
         body: mjcf.Element,
         outside: Color = (0.13, 0.62, 0.30, 1),
         inside: Color = (0.05, 0.22, 0.12, 1),
+        scale: float = 1.0,
     ) -> None:
-        foot = self.FOOT_RADIUS
+        foot, self.radius = scale * self.FOOT_RADIUS, scale * self.radius
         self._disc(body, foot, 0.0, 0.008, name="foot", mass=0.03, rgba=inside)
-        self._ring(body, foot, self.RIM_RADIUS, 0.0, self.HEIGHT, mass=0.006, rgba=outside)
+        self._ring(body, foot, scale * self.RIM_RADIUS, 0.0, self.HEIGHT, mass=0.006, rgba=outside)
         self._mark(body, "center", (0, 0, 0))
         self._region(body, "contain_region", (0, 0, 0.03), (0.04, 0.04, 0.022))
 
@@ -43,9 +45,11 @@ class Plate(Primitive):
         body: mjcf.Element,
         rim: Color = (0.95, 0.95, 0.97, 1),
         middle: Color = (0.15, 0.35, 0.85, 1),
+        scale: float = 1.0,
     ) -> None:
-        self._disc(body, 0.09, 0.0, 0.012, mass=0.3, rgba=rim)
-        self._disc(body, 0.062, 0.0005, 0.0125, **GHOST, rgba=middle)
+        self.radius = scale * self.radius
+        self._disc(body, scale * 0.09, 0.0, 0.012, mass=0.3, rgba=rim)
+        self._disc(body, scale * 0.062, 0.0005, 0.0125, **GHOST, rgba=middle)
         self._mark(body, "center", (0, 0, 0))
 
 
