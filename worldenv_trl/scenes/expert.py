@@ -55,7 +55,7 @@ class ScriptedExpert:
 
     def __init__(self, task: Task) -> None:
         predicate, *arguments = task.goal[0]
-        if len(task.goal) != 1 or predicate not in _SCRIPTS:
+        if len(task.goal) != 1 or predicate not in _SCRIPTS or not task.placements:
             raise ValueError(
                 f"no script for {task.name}: its goal is {task.goal}, scripts exist for {', '.join(_SCRIPTS)}"
             )

@@ -84,14 +84,14 @@ class RendererPool:
                 f"no image can be rendered with MUJOCO_GL={_BACKEND!r} ({errors[0]}): {_REMEDY}"
             ) from errors[0]
 
-    def render(self, qpos: np.ndarray, mocap_pos: np.ndarray) -> dict[str, np.ndarray]:
-        """Draws rows ``qpos [n, nq]``, ``mocap_pos [n, nmocap, 3]``: for each camera
+    def render(self, qpos: np.ndarray, mocap_pos: np.ndarray, mocap_quat: np.ndarray) -> dict[str, np.ndarray]:
+        """Draws rows ``qpos [n, nq]``, ``mocap_pos [n, nmocap, 3]``, ``mocap_quat [n, nmocap, 4]``: for each camera
         ``[n, 3, H, W]`` uint8, upright."""
         size = self.image_size
         images = {name: np.empty((len(qpos), 3, size, size), np.uint8) for name in self.cameras}
         busy = self._painters[: len(qpos)]
         for start, painter in enumerate(busy):
-            painter.draw(qpos, mocap_pos, range(start, len(qpos), len(busy)), images)
+            painter.draw(qpos, mocap_pos, mocap_quat, range(start, len(qpos), len(busy)), images)
         for painter in busy:
             error = painter.wait()
             if error is not None:
@@ -135,10 +135,10 @@ class _Painter:
         data, frame = mujoco.MjData(model), np.empty((fine, fine, 3), np.uint8)
         self._results.put(None)
         while (job := self._jobs.get()) is not None:
-            qpos, mocap_pos, rows, images = job
+            qpos, mocap_pos, mocap_quat, rows, images = job
             try:
                 for row in rows:
-                    data.qpos[:], data.mocap_pos[:] = qpos[row], mocap_pos[row]
+                    data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = qpos[row], mocap_pos[row], mocap_quat[row]
                     mujoco.mj_kinematics(model, data)
                     mujoco.mj_camlight(model, data)
                     if paint is not None:

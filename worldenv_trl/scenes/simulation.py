@@ -66,7 +66,7 @@ class SceneBatch:
         # Bound once: live views of the state, and of the derived fields that predicates and observations read.
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._ctrl, self._targets = self.batch.bind("ctrl"), self.batch.bind("userdata")
-        self._mocap_pos = self.batch.bind("mocap_pos")
+        self._mocap_pos, self._mocap_quat = self.batch.bind("mocap_pos"), self.batch.bind("mocap_quat")
         self.xpos, self.xmat = self.batch.bind("xpos"), self.batch.bind("xmat")
         self.site_xpos, self.site_xmat = self.batch.bind("site_xpos"), self.batch.bind("site_xmat")
         self.cameras, self.renderers = tuple(cameras), None
@@ -115,7 +115,7 @@ class SceneBatch:
         if self.renderers is None:
             return {}
         rows = slice(None) if rows is None else rows
-        images = self.renderers.render(self.qpos[rows], self._mocap_pos[rows])
+        images = self.renderers.render(self.qpos[rows], self._mocap_pos[rows], self._mocap_quat[rows])
         return dict(zip(self.cameras, images.values(), strict=True))
 
     def measured_state(self) -> np.ndarray:
@@ -132,6 +132,14 @@ class SceneBatch:
     def kinematic_state(self) -> np.ndarray:
         """Measured joint angles and the controller's targets, ``[n, 20]`` float32."""
         return np.concatenate([self.qpos[:, self._arm], self._targets], -1).astype(np.float32)
+
+    def load(self, data: mujoco.MjData, row: int) -> None:
+        """Copies where everything is in a row into ``data``."""
+        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = (
+            self.qpos[row],
+            self._mocap_pos[row],
+            self._mocap_quat[row],
+        )
 
     def success(self) -> np.ndarray:
         """Whether the goal holds now, ``[n]`` bool."""

@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -80,9 +81,7 @@ class Task:
         """Colours that show the state: a burner glows while its stove is on."""
         for placement in self.placements:
             if placement.entity is Stove:
-                lever = model.joint(f"{placement.name}/lever")
-                lit = qpos[lever.qposadr[0]] >= Stove.ON_ABOVE
-                model.geom(f"{placement.name}/burner").rgba = (1.0, 0.12, 0.05, 1) if lit else (0.18, 0.18, 0.2, 1)
+                Stove.paint(model, placement.name, qpos)
 
     def init_states(self, split: str, count: int = 50) -> np.ndarray:
         """Initial states ``[count, S]`` float64: settled, free of collisions, fixed by seed.
@@ -93,11 +92,14 @@ class Task:
             ValueError: for an unknown split or a count below 1.
             RuntimeError: if things cannot be placed without overlap, naming the last one tried.
         """
+        self._check_split(split, count)
+        return _init_states(self, split, count).copy()
+
+    def _check_split(self, split: str, count: int) -> None:
         if split not in SPLITS:
             raise ValueError(f"unknown split {split!r}: it must be 'train' or 'test'")
         if count < 1:
             raise ValueError(f"count must be at least 1, got {count}")
-        return _init_states(self, split, count).copy()
 
 
 def _goal_task(
@@ -137,8 +139,17 @@ def list_tasks(suite: str) -> list[str]:
     return [task.name for task in _TASKS if task.suite == suite]
 
 
-def load_task(name: str) -> Task:
-    """The task called ``suite/name``; raises ``ValueError`` with the closest names for an unknown one."""
+def load_task(name: str | Path) -> Task:
+    """The task called ``suite/name``, or that of a file ``path.bddl``.
+
+    Raises:
+        ValueError: with the closest names for an unknown task; for a file that cannot be read, laid out or judged.
+        FileNotFoundError: if there is no such file.
+    """
+    if str(name).endswith(".bddl"):
+        from worldenv_trl.scenes.files import load_bddl  # it builds on this module
+
+        return load_bddl(name)
     tasks = {task.name: task for task in _TASKS}
     if name not in tasks:
         close = difflib.get_close_matches(str(name), tasks, n=1, cutoff=0.3)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import mujoco
+import numpy as np
 from dm_control import mjcf
 
 from worldenv_trl.scenes.entities.base import GHOST, JointState, Primitive
@@ -46,7 +48,7 @@ class MokaPot(Primitive):
 class Stove(Primitive):
     """A flat stove with one burner and a lever; joint ``lever`` turns from 0 (off) to 1.7 rad.
 
-    The burner glows when on: see ``Task.paint``.
+    The burner glows when on.
     """
 
     ON_ABOVE = 1.05  # sixty degrees
@@ -80,3 +82,9 @@ class Stove(Primitive):
         self._region(body, "cook_region", (*self.BURNER, 0.025), (0.05, 0.05, 0.002), on_top=True)
         self.states["TurnOn", ""] = JointState("lever", self.ON_ABOVE, math.inf, (1.2, 1.6))
         self.states["TurnOff", ""] = JointState("lever", -math.inf, 0.2, (0.0, 0.0))
+
+    @classmethod
+    def paint(cls, model: mujoco.MjModel, name: str, qpos: np.ndarray) -> None:
+        """The burner of stove ``name`` glows while it is on."""
+        lit = qpos[model.joint(f"{name}/lever").qposadr[0]] >= cls.ON_ABOVE
+        model.geom(f"{name}/burner").rgba = (1.0, 0.12, 0.05, 1) if lit else (0.18, 0.18, 0.2, 1)

@@ -1,0 +1,125 @@
+"""Tasks from files: initial states at rest, goals judged as the file asks, and LIBERO's own files."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from worldenv_trl.envs import TabletopEnv
+from worldenv_trl.scenes import SceneBatch, ScriptedExpert, load_task
+
+TEXT = """
+(define (problem tabletop) (:domain robosuite) (:language put the bowl on the plate and the soup in the basket)
+  (:regions
+    (left_region (:target table_1) (:ranges ((-0.12 -0.20 -0.04 -0.12))))
+    (right_region (:target table_1) (:ranges ((-0.15 0.0 0.0 0.08))))
+    (far_region (:target table_1) (:ranges ((0.02 0.20 0.04 0.22))))
+    (near_region (:target table_1) (:ranges ((0.10 -0.10 0.14 -0.06))))
+    (contain_region (:target basket_1)))
+  (:fixtures table_1 - table)
+  (:objects bowl_1 - akita_black_bowl plate_1 - plate basket_1 - basket soup_1 - alphabet_soup)
+  (:init (On bowl_1 table_1_left_region) (On plate_1 table_1_right_region) (On basket_1 table_1_far_region)
+         (On soup_1 table_1_near_region))
+  (:goal (And (On bowl_1 plate_1) (In soup_1 basket_1_contain_region))))
+"""
+LIBERO = os.environ.get("WORLDENV_TRL_LIBERO_BDDL")
+
+
+@pytest.fixture
+def path(tmp_path) -> Path:
+    path = tmp_path / "two_things.bddl"
+    path.write_text(TEXT)
+    return path
+
+
+def put(scene: SceneBatch, row: int, thing: str, position) -> None:
+    start = scene.model.jnt_qposadr[scene.model.body(f"{thing}/").jntadr[0]]
+    scene.qpos[row, start : start + 3] = position
+    scene.qpos[row, start + 3 : start + 7] = (1, 0, 0, 0)
+
+
+def test_initial_states_are_at_rest_reproducible_and_distinct(path):
+    task = load_task(path)
+    train, test = task.init_states("train", 6), task.init_states("test", 6)
+    assert np.array_equal(train[:3], task.init_states("train", 3))
+    assert len(np.unique(np.concatenate([train, test]), axis=0)) == 12
+    scene = SceneBatch(task, 6, cameras=(), num_threads=1)
+    scene.reset(np.arange(6), train)
+    before = scene.xpos.copy()
+    for _ in range(10):
+        scene.step(np.zeros((6, 7)))
+    things = [scene.model.body(f"{name}/").id for name in ("bowl_1", "plate_1", "basket_1", "soup_1")]
+    assert np.abs(scene.xpos[:, things] - before[:, things]).max() < 2e-3
+    assert not scene.success().any()
+
+
+def test_the_goal_holds_only_when_every_predicate_does(path):
+    task = load_task(path)
+    scene = SceneBatch(task, 5, cameras=(), num_threads=1)
+    scene.reset(np.arange(5), task.init_states("train", 5))
+    plate, basket = (scene.xpos[:, scene.model.body(f"{name}/").id].copy() for name in ("plate_1", "basket_1"))
+    on_plate, in_basket = (0.01, 0.0, 0.0119), (0.0, 0.02, 0.009)
+    for row in (0, 1, 3, 4):
+        put(scene, row, "bowl_1", plate[row] + on_plate)
+    for row in (0, 2, 3, 4):
+        put(scene, row, "soup_1", basket[row] + in_basket)
+    put(scene, 3, "bowl_1", plate[3] + (0.035, 0.0, 0.0119))  # touches, but off the centre
+    put(scene, 4, "bowl_1", plate[4] + (0.01, 0.0, 0.05))  # above the plate, in the air
+    scene.batch.forward(np.arange(5, dtype=np.int32), stage=mujoco.mjtStage.mjSTAGE_POS.value)
+    relations = task.relations
+    assert relations.evaluate(scene, "On", "bowl_1", "plate_1").tolist() == [True, True, False, False, False]
+    inside = relations.evaluate(scene, "In", "soup_1", "basket_1_contain_region")
+    assert inside.tolist() == [True, False, True, True, True]
+    assert scene.success().tolist() == [True, False, False, False, False]
+
+
+def test_a_file_is_an_environment_like_any_other(path):
+    env = TabletopEnv(str(path), 2, image_size=32, max_steps=4, seed=0)
+    check_env_specs(env, seed=0)
+    rollout = env.rollout(4)
+    assert rollout["observation", "image"].shape == (2, 4, 3, 32, 32)
+    assert rollout[0, 0]["language_instruction"] == "put the bowl on the plate and the soup in the basket"
+    assert torch.equal(rollout["task_id"], torch.full_like(rollout["task_id"], load_task(path).task_id))
+    env.close()
+    with pytest.raises(ValueError, match="no script for"):
+        ScriptedExpert(load_task(path))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("(On bowl_1 plate_1)", "(Open plate_1)", r"two_things.bddl: \(Open plate_1\) in :goal: it has no such joint"),
+        ("(contain_region (:target basket_1))", "(contain_region (:target plate_1))", "region"),
+        ("(In soup_1 basket_1_contain_region)", "(In basket_1_contain_region soup_1)", "not a thing"),
+        ("0.10 -0.10 0.14 -0.06", "0.02 0.20 0.04 0.22", "soup_1 cannot be placed in table_1_near_region"),
+    ],
+)
+def test_what_cannot_be_laid_out_or_judged_is_refused_with_the_file_s_name(path, old, new, message):
+    assert old in TEXT
+    path.write_text(TEXT.replace(old, new))
+    with pytest.raises((ValueError, RuntimeError), match=message):
+        load_task(path).init_states("train", 1)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing\.bddl"):
+        load_task(tmp_path / "nothing.bddl")
+
+
+@pytest.mark.skipif(not LIBERO, reason="set WORLDENV_TRL_LIBERO_BDDL to LIBERO's folder bddl_files")
+@pytest.mark.parametrize("suite", ["libero_spatial", "libero_object", "libero_goal", "libero_10"])
+def test_the_files_of_libero_load_reset_render_and_judge_their_goals(suite):
+    files = sorted(Path(LIBERO, suite).glob("*.bddl"))
+    assert len(files) == 10
+    for file in files:
+        env = TabletopEnv(str(file), 2, image_size=32, init_state_count=2, max_steps=2, seed=0, num_threads=1)
+        rollout = env.rollout(2)
+        assert rollout["observation", "image"].float().std() > 10
+        assert not rollout["next", "success"].any()
+        env.close()

@@ -1,0 +1,159 @@
+"""Goal predicates of task files, with LIBERO's meaning (arXiv 2306.03310, read off its code), for all rows at once.
+
+Two things differ on purpose. The origin of our things is where they rest, LIBERO's is somewhere inside, so heights are
+measured from the bottom. And a region is a box in its own axes; LIBERO's is right for multiples of 90 degrees only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from worldenv_trl.scenes.bddl import Problem
+from worldenv_trl.scenes.entities import Primitive
+
+if TYPE_CHECKING:
+    from worldenv_trl.scenes.simulation import SceneBatch
+
+__all__ = ["Relations", "inside", "within"]
+
+ON_DISTANCE = 0.03  # horizontal distance of the origins of two things, one on the other
+STANDS_BETWEEN = (-0.005, 0.10)  # height over a region's upper face
+SINKS = 0.01  # how far below a region's floor something inside it may be
+
+
+def within(points: np.ndarray, center: np.ndarray, rotation: np.ndarray, half_size: np.ndarray) -> np.ndarray:
+    """``[n]``: points ``[n, 3]`` stand on the upper face of boxes with centres ``[n, 3]`` and axes ``[n, 3, 3]``."""
+    x, y, z = _local(points, center, rotation).T
+    low, high = half_size[2] + np.array(STANDS_BETWEEN)
+    return (np.abs(x) < half_size[0]) & (np.abs(y) < half_size[1]) & (low < z) & (z < high)
+
+
+def inside(points: np.ndarray, center: np.ndarray, rotation: np.ndarray, half_size: np.ndarray) -> np.ndarray:
+    """``[n]``: points ``[n, 3]`` are in the boxes, or at most a centimetre below their floor."""
+    local = _local(points, center, rotation)
+    low = -np.array(half_size) - (0.0, 0.0, SINKS)
+    return ((low < local) & (local < half_size)).all(-1)
+
+
+def _local(points: np.ndarray, center: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    return np.einsum("nji,nj->ni", rotation, points - center)
+
+
+class Relations:
+    """Evaluates the goal of a task file.
+
+    Args:
+        problem: the parsed file.
+        entities: every fixture and object by name.
+        model: the compiled scene.
+        origin: where the workspace's (0, 0) lies on our table (m).
+
+    Raises:
+        ValueError: if a predicate of the goal cannot be evaluated with these things, naming the file.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        entities: Mapping[str, Primitive],
+        model: mujoco.MjModel,
+        origin: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        self.problem, self.entities, self.model = problem, entities, model
+        self.origin = np.array((*origin, 0.0))
+        self._data = mujoco.MjData(model)
+        for predicate, *arguments in problem.goal:
+            if predicate not in ("On", "In") and (predicate, self._part(arguments[0])[1]) not in self._states(
+                arguments
+            ):
+                raise ValueError(f"{problem.source}: ({predicate} {arguments[0]}) in :goal: it has no such joint")
+            if predicate in ("On", "In"):
+                self._part(arguments[1])
+                if arguments[0] not in entities:
+                    raise ValueError(f"{problem.source}: ({predicate} {arguments[0]} ...) in :goal: not a thing")
+
+    def holds(self, scene: SceneBatch) -> np.ndarray:
+        """``[n]`` bool: the whole goal holds in the current state of each row."""
+        result = np.ones(scene.num_envs, bool)
+        for predicate, *arguments in self.problem.goal:
+            result &= self.evaluate(scene, predicate, *arguments)
+        return result
+
+    def evaluate(self, scene: SceneBatch, predicate: str, *arguments: str) -> np.ndarray:
+        """``[n]`` bool: one predicate."""
+        if predicate == "On":
+            return self._on(scene, *arguments)
+        if predicate == "In":
+            return self._in(scene, *arguments)
+        thing, part = self._part(arguments[0])
+        state = self.entities[thing].states[predicate, part]
+        position = scene.qpos[:, self.model.joint(f"{thing}/{state.joint}").qposadr[0]]
+        return (state.low <= position) & (position <= state.high)
+
+    # ------------------------------------------------------------------------------------------------- arguments
+
+    def _states(self, arguments: list[str]) -> Mapping:
+        thing, _ = self._part(arguments[0])
+        return self.entities[thing].states if thing in self.entities else {}
+
+    def _part(self, name: str) -> tuple[str, str]:
+        """The entity, or workspace, and its region (or "") that ``name`` means."""
+        if name in self.entities:
+            return name, ""
+        region = self.problem.regions.get(name)
+        if region is None:
+            raise ValueError(f"{self.problem.source}: {name!r} in :goal is neither a thing nor a region")
+        part = name.removeprefix(f"{region.target}_")
+        if region.target in self.entities and part not in self.entities[region.target].regions:
+            known = ", ".join(self.entities[region.target].regions) or "none"
+            raise ValueError(f"{self.problem.source}: {region.target} has no region {part!r}; it has {known}")
+        return region.target, part
+
+    def _position(self, scene: SceneBatch, thing: str) -> np.ndarray:
+        return scene.xpos[:, self.model.body(f"{thing}/").id]
+
+    def _box(self, scene: SceneBatch, thing: str, part: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Centre ``[n, 3]``, axes ``[n, 3, 3]`` and half size ``[3]`` of a region."""
+        if thing in self.entities:
+            site = self.model.site(f"{thing}/{part}").id
+            axes = scene.site_xmat[:, site].reshape(-1, 3, 3)
+            return scene.site_xpos[:, site], axes, np.array(self.entities[thing].regions[part].half_size)
+        low_x, low_y, high_x, high_y = self.problem.regions[f"{thing}_{part}"].ranges[0]  # LIBERO: the first one
+        center = self.origin + np.array(((low_x + high_x) / 2, (low_y + high_y) / 2, 0.0))
+        half = np.array(((high_x - low_x) / 2, (high_y - low_y) / 2, 0.0))
+        n = scene.num_envs
+        return np.broadcast_to(center, (n, 3)), np.broadcast_to(np.eye(3), (n, 3, 3)), half
+
+    # ------------------------------------------------------------------------------------------------- On, In
+
+    def _on(self, scene: SceneBatch, top: str, below: str) -> np.ndarray:
+        thing, part = self._part(below)
+        if not part:
+            offset = self._position(scene, top) - self._position(scene, thing)
+            near = (offset[:, 2] >= 0) & (np.hypot(offset[:, 0], offset[:, 1]) < ON_DISTANCE)
+            return self._touching(scene, near, top, thing)
+        near = within(self._position(scene, top), *self._box(scene, thing, part))
+        return near if thing not in self.entities else self._touching(scene, near, top, thing)
+
+    def _in(self, scene: SceneBatch, thing: str, place: str) -> np.ndarray:
+        owner, part = self._part(place)
+        if owner in self.entities and not part:
+            part = "contain_region"
+        return inside(self._position(scene, thing), *self._box(scene, owner, part))
+
+    def _touching(self, scene: SceneBatch, rows: np.ndarray, first: str, second: str) -> np.ndarray:
+        """Those of ``rows [n]`` in which two things are in contact; contacts are searched in no other row."""
+        touching = np.zeros_like(rows)
+        roots = [self.model.body(f"{name}/").id for name in (first, second)]
+        for row in np.flatnonzero(rows):
+            scene.load(self._data, row)
+            mujoco.mj_kinematics(self.model, self._data)
+            mujoco.mj_comPos(self.model, self._data)
+            mujoco.mj_collision(self.model, self._data)
+            pairs = self.model.body_rootid[self.model.geom_bodyid[self._data.contact.geom]]  # [contacts, 2]
+            touching[row] = bool((np.sort(pairs, -1) == np.sort(roots)).all(-1).any())
+        return touching
