@@ -63,6 +63,8 @@ class WorldModel:
     weight_decay: float = 1e-3
     unroll_prob: float = 0.5
     """Share of updates in which the second chunk is generated from the model's own first chunk."""
+    failure_share: float | None = 0.6
+    """Share of the windows, in every task, that come from episodes that fail; None draws from all episodes alike."""
     frames_per_chunk: int | None = None
     """Frames of each chunk that are painted and scored in an update; all if None."""
     denoise_steps: int = 1
@@ -179,13 +181,13 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
         ),
     ),
     "improve": (
-        "Two rounds that raise held-out success on every task; at most 60 minutes on 2 cores.",
+        "The scale that raises held-out success; at most 60 minutes on 2 cores.",
         WorldEnvConfig(
             run_dir=Path("runs/improve"),
             train_states=150,
-            rounds=2,
+            explore=Explore(episodes_per_task=480),
             reflector=Reflector(choose_threshold=True),
-            post_train=PostTrain(iterations=56),
+            post_train=PostTrain(iterations=40, probe_every=2, probe_contexts=16),
         ),
     ),
 }

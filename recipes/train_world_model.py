@@ -37,7 +37,9 @@ def run(
     training = concatenate_episodes([demonstrations, training])
     model = new_model(config) if previous is None else load_world_model(folder, previous.removeprefix("world_model"))
     model.train()
-    sampler = WindowSampler(training, ForwardKinematics(), model, seed=config.seed + rounds)
+    sampler = WindowSampler(
+        training, ForwardKinematics(), model, failure_share=settings.failure_share, seed=config.seed + rounds
+    )
     loss = DiffusionLoss(model, unroll_prob=settings.unroll_prob, frames_per_chunk=settings.frames_per_chunk)
     steps = settings.steps if previous is None else settings.refit_steps
     optimizer = torch.optim.AdamW(model.parameters(), lr=settings.lr, weight_decay=settings.weight_decay)

@@ -94,6 +94,26 @@ def test_the_sampler_starts_at_the_reset_more_often_when_asked():
     assert 0.4 < at_reset < 0.62
 
 
+def test_failures_get_their_share_of_every_task():
+    episodes = make_episodes([12, 12, 8, 12, 10])
+    episodes[keys.TASK_ID] = torch.tensor([[0], [0], [0], [0], [1]])
+    success = torch.zeros(5, 13, dtype=torch.bool)
+    success[:3, 5:] = True  # task 0: three successes and a failure; task 1 only fails
+    episodes["success"] = success
+
+    def shares(failure_share):
+        sampler = WindowSampler(episodes, ForwardKinematics(), FakeModel(), failure_share=failure_share, seed=0)
+        row = sampler.sample(6000)["memory", "reference"][:, 0, 0, 0].long() // 50  # frames count from 50 r
+        return torch.bincount(row, minlength=5) / 6000
+
+    starts = torch.tensor([9, 9, 5, 9, 7]) / 39
+    assert torch.allclose(shares(None), starts, atol=0.03)
+    wanted = torch.cat([0.4 * torch.tensor([9, 9, 5]) / 23, torch.tensor([0.6, 1.0])]) / 2
+    assert torch.allclose(shares(0.6), wanted, atol=0.03)
+    with pytest.raises(ValueError, match="failure_share must lie between 0 and 1, got 2"):
+        shares(2)
+
+
 def test_the_sampler_repeats_itself_for_a_seed():
     episodes = make_episodes([12, 9])
     first, second = (WindowSampler(episodes, ForwardKinematics(), FakeModel(), seed=4).sample(8) for _ in range(2))

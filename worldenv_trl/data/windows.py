@@ -90,6 +90,10 @@ def world_model_windows(
 class WindowSampler:
     """Draws windows of the episodes, every frame that leaves room for a chunk being as likely a start as any other.
 
+    A model that sees successes far more often than failures paints a success whenever it is in doubt, and a policy that
+    learns in it looks for the doubt. With a ``failure_share`` the tasks are drawn equally often, and that share of each
+    task's windows comes from episodes that never reach the goal.
+
     Only a window that starts at the reset shows the first frame being left, while imagination starts there every time:
     a share of the windows starts there on purpose.
 
@@ -101,6 +105,7 @@ class WindowSampler:
     Keyword Args:
         chunks: consecutive chunks in a window.
         reset_share: share of windows that start at an episode's first frame; default: one decision in eight.
+        failure_share: see above; None draws from all episodes alike.
         seed: of the draws; from torch's generator when None.
 
     Raises:
@@ -115,12 +120,15 @@ class WindowSampler:
         *,
         chunks: int = 2,
         reset_share: float = 0.125,
+        failure_share: float | None = None,
         seed: int | None = None,
     ) -> None:
         if chunks < 1:
             raise ValueError(f"chunks must be at least 1, got {chunks}")
         if not 0 <= reset_share <= 1:
             raise ValueError(f"reset_share must lie between 0 and 1, got {reset_share}")
+        if failure_share is not None and not 0 <= failure_share <= 1:
+            raise ValueError(f"failure_share must lie between 0 and 1, got {failure_share}")
         length = episodes["length"].squeeze(-1)
         if not len(episodes) or not bool(length.any()):
             raise ValueError(f"the {len(episodes)} episodes hold no executed step: there is no window to draw")
@@ -130,22 +138,36 @@ class WindowSampler:
         self.episodes, self.world_model = episodes, world_model
         self.chunks, self.reset_share = chunks, reset_share
         self.poses = predicted_poses(episodes, kinematics)
-        starts = ((length - world_model.chunk_length).clamp(min=0) + 1) * (length > 0)  # [R]
-        self._ends = starts.cumsum(0)  # the windows, numbered episode by episode
-        self._starts = starts
+        self._starts = ((length - world_model.chunk_length).clamp(min=0) + 1) * (length > 0)  # [R]
+        self._weights = _window_weights(episodes, self._starts, failure_share)
         self._generator = torch.Generator()
         self._generator.manual_seed(int(torch.randint(2**31, ()).item()) if seed is None else seed)
 
     def __len__(self) -> int:
         """Distinct windows."""
-        return int(self._ends[-1])
+        return int(self._starts.sum())
 
     def sample(self, batch_size: int) -> TensorDict:
         """``batch_size`` windows, with replacement; see :func:`world_model_windows`."""
-        number = torch.randint(len(self), (batch_size,), generator=self._generator)
+        episode = torch.multinomial(self._weights, batch_size, replacement=True, generator=self._generator)
+        place = torch.rand(batch_size, generator=self._generator)
         at_reset = torch.rand(batch_size, generator=self._generator) < self.reset_share
-        number, at_reset = number.to(self._ends.device), at_reset.to(self._ends.device)
-        episode = torch.searchsorted(self._ends, number, right=True)
-        start = number - (self._ends - self._starts)[episode]
+        episode, place, at_reset = (value.to(self._starts.device) for value in (episode, place, at_reset))
+        start = torch.minimum((place * self._starts[episode]).long(), self._starts[episode] - 1)
         start = start.masked_fill(at_reset, 0)
         return world_model_windows(self.episodes, self.poses, self.world_model, episode, start, chunks=self.chunks)
+
+
+def _window_weights(episodes: TensorDictBase, starts: Tensor, failure_share: float | None) -> Tensor:
+    """How often each episode is drawn ``[R]``, on the CPU: by its windows, within its task and outcome."""
+    weights = starts.double().cpu()
+    if failure_share is None:
+        return weights
+    task, failed = episodes[TASK_ID].squeeze(-1).cpu(), ~episodes["success"].any(-1).cpu()
+    shared = torch.zeros_like(weights)
+    for number in task.unique():
+        for outcome, share in ((True, failure_share), (False, 1 - failure_share)):
+            rows = (task == number) & (failed == outcome)
+            shared[rows] = share * weights[rows] / weights[rows].sum().clamp_min(1)
+        shared[task == number] /= shared[task == number].sum().clamp_min(1e-9)  # one outcome may be missing
+    return shared if shared.any() else weights
