@@ -1,6 +1,7 @@
 """A contact sheet of the scenes: for every task, initial states, the expert at work, and where it ends.
 
-``python recipes/show_scenes.py --suite goal --out scenes.png``
+``python recipes/show_scenes.py --suite goal --out scenes.png``, or ``--suite <folder of BDDL files>``, which have no
+expert: their initial states alone.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ class Sheet:
 
     out: Path = Path("scenes.png")
     suite: str = "goal"
+    """A suite, or a folder of BDDL files."""
     split: str = "train"
     columns: int = 10
     """Initial states of each task, the first ones of the split."""
@@ -36,15 +38,23 @@ class Sheet:
 
 
 def main(settings: Sheet) -> None:
-    if settings.suite not in list_suites():
-        raise SystemExit(f"unknown suite {settings.suite!r}: it must be one of {', '.join(list_suites())}")
-    names = list_tasks(settings.suite)
+    names = task_names(settings.suite)
     rows = [row for name in names for row in task_rows(name, settings)]
     sheet = torch.cat(rows, -2).permute(1, 2, 0).repeat_interleave(settings.zoom, 0)
     sheet = sheet.repeat_interleave(settings.zoom, 1)
     settings.out.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(sheet.numpy()).save(settings.out)
     print(f"{settings.out}: {len(names)} tasks, {settings.columns} initial states each")
+
+
+def task_names(suite: str) -> list[str]:
+    """The tasks of a suite, or the BDDL files of a folder."""
+    if suite in list_suites():
+        return list_tasks(suite)
+    files = sorted(str(path) for path in Path(suite).glob("*.bddl"))
+    if not files:
+        raise SystemExit(f"unknown suite {suite!r}: it must be one of {', '.join(list_suites())}, or a folder of .bddl")
+    return files
 
 
 def task_rows(name: str, settings: Sheet) -> list[torch.Tensor]:
@@ -56,10 +66,15 @@ def task_rows(name: str, settings: Sheet) -> list[torch.Tensor]:
         cameras=(settings.camera,),
         init_split=settings.split,
         init_state_mode="cycle",
+        init_state_count=settings.columns,
         terminate_on_success=False,
         seed=0,
     )
     image = keys.IMAGE if settings.camera == "agentview" else ("observation", "wrist_image")
+    if name.endswith(".bddl"):
+        images = env.reset()[image]
+        env.close()
+        return [torch.cat(list(images), -1)]
     expert, data = ExpertPolicy(env), env.reset()
     frames, solved = [data[image]], torch.zeros(settings.columns, dtype=torch.bool)
     while not solved.all() and len(frames) < load_task(name).max_steps:

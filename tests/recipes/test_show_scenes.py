@@ -18,6 +18,19 @@ def test_the_sheet_has_a_row_for_every_task_and_moment(tmp_path, capsys):
     assert (start != end).any(-1).mean() > 0.05
 
 
+def test_a_folder_of_files_shows_their_initial_states(tmp_path):
+    (tmp_path / "one.bddl").write_text(
+        """(define (problem tabletop) (:domain robosuite) (:language look at the mug)
+             (:regions (spot (:target table_1) (:ranges ((-0.1 -0.1 0.1 0.1)))))
+             (:fixtures table_1 - table) (:objects mug_1 - red_coffee_mug)
+             (:init (On mug_1 table_1_spot)) (:goal (On mug_1 table_1_spot)))"""
+    )
+    main(Sheet(out=tmp_path / "sheet.png", suite=str(tmp_path), columns=3, image_size=32, zoom=1))
+    sheet = np.asarray(Image.open(tmp_path / "sheet.png"))
+    assert sheet.shape == (32, 3 * 32, 3)
+    assert (sheet[:, :32] != sheet[:, 32:64]).any()
+
+
 def test_an_unknown_suite_is_named(tmp_path):
     with pytest.raises(SystemExit, match="kitchen"):
         main(Sheet(out=tmp_path / "sheet.png", suite="kitchen"))

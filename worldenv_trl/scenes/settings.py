@@ -37,7 +37,7 @@ class Setting:
         return panda.BASE_POSITION[0] + self.base_distance, 0.0
 
 
-_WIDE = look_at("agentview", (0.92, 0.0, 0.78), (-0.02, 0.0, 0.03), 38.0)
+_WIDE = look_at("agentview", (0.86, 0.0, 0.80), (-0.09, 0.0, 0.05), 36.0)
 _TABLETOP = Setting(0.66, (0.72, 0.70, 0.66, 1), (0.45, 0.52, 0.50, 1), _WIDE)
 _KITCHEN = Setting(0.66, (0.62, 0.64, 0.60, 1), (0.78, 0.70, 0.48, 1), _WIDE)
 _LIVING_ROOM = Setting(0.51, (0.55, 0.42, 0.32, 1), (0.62, 0.60, 0.64, 1), _WIDE)
