@@ -1,8 +1,8 @@
 """Boxes of regions against LIBERO's own verdicts.
 
 Recorded from LIBERO (mujoco 3.2.3, robosuite 1.4.0): where a thing was from the region's centre (m, world axes), the
-region's half size and yaw, and what LIBERO said. All 42 recorded ``In`` and 80 of 84 ``On`` agree; in the other four the
-box holds, but the two things do not touch, which ``On`` asks for as well (see ``test_files.py``).
+region's half size and yaw, and what LIBERO said. All 42 recorded ``In`` and 80 of 84 ``On`` agree; in the other four
+the box holds, but the two things do not touch, which ``On`` asks for as well (see ``test_files.py``).
 """
 
 from __future__ import annotations
