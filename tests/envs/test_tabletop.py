@@ -251,6 +251,23 @@ def test_without_termination_rows_run_to_the_limit_and_reward_is_success():
     assert rollout["next", SUCCESS][:, -1].all() and not rollout["next", SUCCESS][:, 0].any()
 
 
+def test_physics_that_blow_up_end_their_own_row_only():
+    env, calm = (TabletopEnv(BOWL, 3, image_size=32, seed=0, terminate_on_success=False) for _ in range(2))
+    td, expected = env.reset(), calm.reset()
+    scene = env.scenes[0][0]
+    scene.qvel[1, -6:] = 1e8
+    action = 0.3 * torch.ones(3, 7)
+    with pytest.warns(UserWarning, match=r"put_the_bowl_on_the_plate: the physics of row 1 blew up at step 0 .*seed 0"):
+        after = env.step(td.set("action", action))["next"]
+    expected = calm.step(expected.set("action", action))["next"]
+    assert after["truncated"].squeeze(-1).tolist() == after["done"].squeeze(-1).tolist() == [False, True, False]
+    assert after["observation", "state"].isfinite().all()
+    for row in (0, 2):
+        assert torch.equal(after["observation", "image"][row], expected["observation", "image"][row])
+    env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, batch_size=[3]))
+    assert np.isfinite(scene.qpos).all() and np.abs(scene.qvel[1]).max() < 1
+
+
 def test_commanded_proprio_is_the_accumulated_target():
     env = make(DRAWER, 1, cameras=(), proprio="commanded")
     plan = torch.zeros(3, 1, 7)

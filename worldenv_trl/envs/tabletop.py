@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -47,7 +48,8 @@ class TabletopEnv(EnvBase):
     """``num_envs`` copies of one or several tasks, stepped and rendered together. Batch-locked; honours ``_step``.
 
     A row's episode is a function of (seed, number of the episode, actions), bit for bit, whatever the batch and the
-    threads: the states that a batch of 16 draws in one reset are those that one row draws in 16 resets.
+    threads: the states that a batch of 16 draws in one reset are those that one row draws in 16 resets. A row whose
+    physics blows up is truncated, with a warning that says how to see it again; the others do not notice.
 
     Args:
         task: a task, its name, or several: groups of rows are dealt to the tasks in turn (round robin).
@@ -298,14 +300,23 @@ class TabletopEnv(EnvBase):
         active = tensordict.get("_step", None)
         active = np.ones(self.num_envs, bool) if active is None else active.reshape(-1).numpy()
         action = self._checked_action(tensordict, active)
+        broken = np.zeros((self.num_envs, 1), bool)
         for block in self._blocks:
-            block.scene.step(action[block.rows], active[block.rows])
+            local = block.scene.step(action[block.rows], active[block.rows])
+            broken[block.rows[local]] = True
+            for row in block.rows[local]:
+                warnings.warn(
+                    f"{block.scene.task.name}: the physics of row {row} blew up at step {int(self._steps[row, 0])} of "
+                    f"episode {int(self._episode[row])} (context {int(self._context[row, 0])}, seed {self._seed}); "
+                    "the row is truncated",
+                    stacklevel=2,
+                )
         self._steps[active] += 1
         self._read(active)
         self._reward[active] = self._success[active]
         out = self._observe()
         terminated = self._success & self.terminate_on_success
-        truncated = ~terminated & (self._steps >= self._limit)
+        truncated = ~terminated & (broken | (self._steps >= self._limit))
         out.set("reward", torch.from_numpy(self._reward.copy()))
         for name, value in (("terminated", terminated), ("truncated", truncated), ("done", terminated | truncated)):
             out.set(name, torch.from_numpy(value))

@@ -28,6 +28,7 @@ class TabletopArena:
         self.root = root = mjcf.RootElement(model="scene")
         root.compiler.angle = "radian"
         root.option.set_attributes(timestep=panda.TIMESTEP, integrator="implicitfast", cone="elliptic", impratio=10)
+        root.option.flag.autoreset = "disable"  # a state that blows up must be seen, not silently replaced
         root.size.nuserdata = panda.USERDATA
         # Round shapes cost by their facets, and shadows cost most of all (software GL).
         root.visual.quality.set_attributes(numslices=10, numstacks=6, numquads=1, shadowsize=0)

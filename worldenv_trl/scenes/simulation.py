@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from worldenv_trl.scenes.tasks import Task
 
 _POSITIONS = mujoco.mjtStage.mjSTAGE_POS.value
+_MAX_SPEED = 1e4  # m/s or rad/s; a simulation that is faster has blown up
 
 
 class SceneBatch:
@@ -92,11 +93,15 @@ class SceneBatch:
             self.batch.state[rows] = sim_state
             self._make_current(np.unique(rows))  # the batch takes sorted rows only
 
-    def step(self, action: np.ndarray, active: np.ndarray | None = None) -> None:
-        """One 20 Hz control step with ``action [n, 7]``; rows not ``active [n]`` keep their state bit for bit."""
+    def step(self, action: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
+        """One 20 Hz control step with ``action [n, 7]``; rows not ``active [n]`` keep their state bit for bit.
+
+        Returns the rows ``[k]`` whose physics blew up; they are left in the state before this step.
+        """
         rows = np.arange(self.num_envs) if active is None else np.flatnonzero(active)
         if not len(rows):
-            return
+            return rows
+        before = self.batch.state[rows]
         self._targets[rows] = controller.advance_targets(self._targets[rows], action[rows])
         self._ctrl[np.ix_(rows, self._actuators[:7])] = controller.joint_targets(
             self.qpos[np.ix_(rows, self._arm)], self._targets[rows]
@@ -104,7 +109,12 @@ class SceneBatch:
         self._ctrl[rows, self._actuators[7]] = panda.FINGER_TRAVEL * self._targets[rows, 12]
         rows = rows.astype(np.int32)
         self.batch.step(rows, nstep=panda.SUBSTEPS)
+        with np.errstate(invalid="ignore"):
+            sane = (np.abs(self.qvel[rows]) < _MAX_SPEED).all(-1) & np.isfinite(self.qpos[rows]).all(-1)
+        if not sane.all():
+            self.batch.state[rows[~sane]] = before[~sane]
         self._make_current(rows)
+        return rows[~sane]
 
     def _make_current(self, rows: np.ndarray) -> None:
         # Derived poses only: they do not touch the integration state, so a reset to it continues identically.
