@@ -5,7 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs.transforms import MultiAction, StepCounter, TransformedEnv
-from torchrl.envs.utils import check_env_specs
+from torchrl.envs.utils import check_env_specs, step_mdp
 
 from worldenv_trl.envs import ExpertPolicy, TabletopEnv, context_id
 from worldenv_trl.keys import (
@@ -266,6 +266,22 @@ def test_physics_that_blow_up_end_their_own_row_only():
         assert torch.equal(after["observation", "image"][row], expected["observation", "image"][row])
     env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, batch_size=[3]))
     assert np.isfinite(scene.qpos).all() and np.abs(scene.qvel[1]).max() < 1
+
+
+def test_going_on_after_success_can_undo_it():
+    env = TabletopEnv(DRAWER, 4, cameras=(), seed=0, terminate_on_success=False)
+    opened = env.rollout(64, ExpertPolicy(env), break_when_any_done=False)["next", "success"]
+    assert opened.any(1).all()
+    td, expert = env.reset(), ExpertPolicy(env)
+    history = []
+    for step in range(60):
+        td = expert(td)
+        if step and history[-1].any():  # some drawer is open: from now on all hands push back
+            td["action"][:, :3] = torch.tensor([0.0, -0.6, 0.0])
+        td = step_mdp(env.step(td))
+        history.append(td["success"].squeeze(-1))
+    history = torch.stack(history)  # World-Env Figure 6
+    assert history.any() and not history[-1].any()
 
 
 def test_commanded_proprio_is_the_accumulated_target():
