@@ -87,7 +87,22 @@ def test_a_file_is_an_environment_like_any_other(path):
     assert rollout[0, 0]["language_instruction"] == "put the bowl on the plate and the soup in the basket"
     assert torch.equal(rollout["task_id"], torch.full_like(rollout["task_id"], load_task(path).task_id))
     env.close()
-    with pytest.raises(ValueError, match="no script for"):
+
+
+def test_the_expert_puts_one_thing_on_and_the_other_into_its_place(path):
+    task = load_task(path)
+    scene, expert = SceneBatch(task, 10, cameras=(), num_threads=1), ScriptedExpert(task)
+    scene.reset(np.arange(10), task.init_states("train", 10))
+    solved = np.zeros(10, bool)
+    for _ in range(140):
+        scene.step(expert(scene))
+        solved |= scene.success()
+    assert solved.sum() >= 9
+
+
+def test_a_goal_without_a_script_is_refused(path):
+    path.write_text(TEXT.replace("- alphabet_soup", "- cookies").replace("0.10 -0.10 0.14 -0.06", "0.1 -0.2 0.1 -0.2"))
+    with pytest.raises(ValueError, match=r"no script for .*soup_1 cannot be gripped"):
         ScriptedExpert(load_task(path))
 
 

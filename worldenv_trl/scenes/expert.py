@@ -6,7 +6,6 @@ Each step it looks at the true state again, so actions disturbed from outside ar
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,50 +15,28 @@ from worldenv_trl.scenes import controller, predicates
 from worldenv_trl.scenes.entities.cookware import Stove
 from worldenv_trl.scenes.entities.storage import Cabinet
 from worldenv_trl.scenes.entities.tableware import Bowl, Plate
+from worldenv_trl.scenes.files import FileTask
+from worldenv_trl.scenes.skills import CLOSE, OPEN, Phase, body, pick_and_place, tcp
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.simulation import SceneBatch
     from worldenv_trl.scenes.tasks import Task
 
 _DOWN = np.diag([1.0, -1.0, -1.0])  # the hand points straight down, fingers open along y
-_OPEN, _CLOSE = -1.0, 1.0
-
-
-@dataclass(frozen=True)
-class _Phase:
-    """Go to ``target(scene, memory) [n, 3]`` until within ``tolerance`` for ``dwell`` steps, or for ``limit`` at most.
-
-    ``remember(scene) [n, 3]`` is read once on entry and handed to ``target`` as its memory. A row where
-    ``still(scene) [n]`` is false has lost what it worked on and starts over.
-    """
-
-    target: Callable[[SceneBatch, np.ndarray], np.ndarray]
-    gripper: float
-    tolerance: float = 0.008
-    dwell: int = 1
-    speed: float = 0.45
-    limit: int = 14
-    remember: Callable[[SceneBatch], np.ndarray] | None = None
-    still: Callable[[SceneBatch], np.ndarray] | None = None
 
 
 class ScriptedExpert:
     """Solves one task; ``expert(scene)`` gives normalised actions ``[n, 7]``.
 
     Args:
-        task: a task of the ``goal`` suite.
+        task: a task of the ``goal`` suite, or of a file that asks for things to be put on or into others.
 
     Raises:
         ValueError: for a task nobody wrote a script for.
     """
 
     def __init__(self, task: Task) -> None:
-        predicate, *arguments = task.goal[0]
-        if len(task.goal) != 1 or predicate not in _SCRIPTS or not task.placements:
-            raise ValueError(
-                f"no script for {task.name}: its goal is {task.goal}, scripts exist for {', '.join(_SCRIPTS)}"
-            )
-        self._phases = _SCRIPTS[predicate](*arguments)
+        self._phases = _phases(task)
         self.reset()
 
     def reset(self, rows: np.ndarray | None = None) -> None:
@@ -99,7 +76,7 @@ class ScriptedExpert:
             following[ready] += 1
             if phase.still is not None:
                 lost = rows & ~phase.still(scene)
-                following[lost] = 0
+                following[lost] = phase.again
                 ready |= lost
             self._dwell[ready], self._spent[ready], self._memory[ready] = 0, 0, np.nan
         self._phase = following
@@ -108,17 +85,30 @@ class ScriptedExpert:
         return action
 
 
-def _put_on(bowl: str, plate: str) -> list[_Phase]:
+def _phases(task: Task) -> list[Phase]:
+    phases: list[Phase] = []
+    for predicate, *arguments in task.goal:
+        if isinstance(task, FileTask) and predicate in ("On", "In"):
+            phases += pick_and_place(task, *arguments, again=len(phases))
+        elif isinstance(task, FileTask) or predicate not in _SCRIPTS or len(task.goal) > 1:
+            known = "On, In" if isinstance(task, FileTask) else ", ".join(_SCRIPTS)
+            raise ValueError(f"no script for {task.name}: its goal is {task.goal}, scripts exist for {known}")
+        else:
+            phases += _SCRIPTS[predicate](*arguments)
+    return phases
+
+
+def _put_on(bowl: str, plate: str) -> list[Phase]:
     def rim(scene: SceneBatch, height: float) -> np.ndarray:
         radius = Bowl.RIM_RADIUS - 0.004
-        return np.add(_body(scene, bowl), (0.0, radius, height))
+        return np.add(body(scene, bowl), (0.0, radius, height))
 
     def over_plate(scene: SceneBatch, bottom: float) -> np.ndarray:
-        held = _tcp(scene) - _body(scene, bowl)
-        return _body(scene, plate) + held + (0.0, 0.0, bottom)
+        held = tcp(scene) - body(scene, bowl)
+        return body(scene, plate) + held + (0.0, 0.0, bottom)
 
     def held(scene: SceneBatch) -> np.ndarray:
-        return np.linalg.norm(_tcp(scene) - _body(scene, bowl), axis=-1) < 2 * Bowl.RIM_RADIUS
+        return np.linalg.norm(tcp(scene) - body(scene, bowl), axis=-1) < 2 * Bowl.RIM_RADIUS
 
     def placed(scene: SceneBatch) -> np.ndarray:
         return predicates.on(scene, bowl, plate)
@@ -126,18 +116,18 @@ def _put_on(bowl: str, plate: str) -> list[_Phase]:
     # Deep enough that the pads carry the bowl level; slow at the end, so that it is set down rather than dropped.
     grip = Bowl.HEIGHT - 0.022
     return [
-        _Phase(lambda s, m: rim(s, 0.11), _OPEN, tolerance=0.025),
-        _Phase(lambda s, m: rim(s, grip), _OPEN, tolerance=0.006),
-        _Phase(lambda s, m: m, _CLOSE, tolerance=0.03, dwell=6, remember=lambda s: rim(s, grip)),
-        _Phase(lambda s, m: m, _CLOSE, tolerance=0.02, remember=lambda s: np.add(_tcp(s), (0.0, 0.0, 0.07))),
-        _Phase(lambda s, m: over_plate(s, 0.06), _CLOSE, tolerance=0.010, still=held),
-        _Phase(lambda s, m: over_plate(s, Plate.TOP - 0.001), _CLOSE, tolerance=0.005, speed=0.2, still=held),
-        _Phase(lambda s, m: m, _OPEN, tolerance=0.03, dwell=5, remember=_tcp),
-        _Phase(lambda s, m: m, _OPEN, remember=lambda s: np.add(_tcp(s), (0.0, 0.0, 0.10)), still=placed),
+        Phase(lambda s, m: rim(s, 0.11), OPEN, tolerance=0.025),
+        Phase(lambda s, m: rim(s, grip), OPEN, tolerance=0.006),
+        Phase(lambda s, m: m, CLOSE, tolerance=0.03, dwell=6, remember=lambda s: rim(s, grip)),
+        Phase(lambda s, m: m, CLOSE, tolerance=0.02, remember=lambda s: np.add(tcp(s), (0.0, 0.0, 0.07))),
+        Phase(lambda s, m: over_plate(s, 0.06), CLOSE, tolerance=0.010, still=held),
+        Phase(lambda s, m: over_plate(s, Plate.TOP - 0.001), CLOSE, tolerance=0.005, speed=0.2, still=held),
+        Phase(lambda s, m: m, OPEN, tolerance=0.03, dwell=5, remember=tcp),
+        Phase(lambda s, m: m, OPEN, remember=lambda s: np.add(tcp(s), (0.0, 0.0, 0.10)), still=placed),
     ]
 
 
-def _pull_open(cabinet: str, drawer: str) -> list[_Phase]:
+def _pull_open(cabinet: str, drawer: str) -> list[Phase]:
     def handle(scene: SceneBatch, height: float = 0.0, behind: float = 0.0) -> np.ndarray:
         bar = scene.site_xpos[:, scene.model.site(f"{cabinet}/{drawer}_handle").id]
         return np.add(bar, (0.0, -behind, height))
@@ -149,38 +139,30 @@ def _pull_open(cabinet: str, drawer: str) -> list[_Phase]:
         return handle(scene) + further
 
     def hooked(scene: SceneBatch) -> np.ndarray:
-        x, y, z = (_tcp(scene) - handle(scene)).T
+        x, y, z = (tcp(scene) - handle(scene)).T
         return (np.abs(x) < Cabinet.HANDLE_HALF_WIDTH + 0.008) & (y < 0.0) & (y > -0.065) & (np.abs(z) < 0.025)
 
     # The closed fingers hook the bar from behind.
     hook = 0.5 * Cabinet.HANDLE_REACH
     return [
-        _Phase(lambda s, m: handle(s, 0.07, hook), _CLOSE, tolerance=0.02),
-        _Phase(lambda s, m: handle(s, 0.0, hook), _CLOSE, tolerance=0.008),
-        _Phase(opened, _CLOSE, still=hooked),
+        Phase(lambda s, m: handle(s, 0.07, hook), CLOSE, tolerance=0.02),
+        Phase(lambda s, m: handle(s, 0.0, hook), CLOSE, tolerance=0.008),
+        Phase(opened, CLOSE, still=hooked),
     ]
 
 
-def _push_on(stove: str) -> list[_Phase]:
+def _push_on(stove: str) -> list[Phase]:
     def along(scene: SceneBatch, ahead: float, height: float) -> np.ndarray:
         lever = scene.qpos[:, scene.model.jnt_qposadr[scene.model.joint(f"{stove}/lever").id]]
         angle = np.minimum(lever + ahead, Stove.ON_ABOVE + 0.25) + Stove.START_ANGLE
         direction = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1)
-        return _body(scene, stove) + Stove.PIVOT + Stove.PEG_RADIUS * direction + (0.0, 0.0, height)
+        return body(scene, stove) + Stove.PIVOT + Stove.PEG_RADIUS * direction + (0.0, 0.0, height)
 
     return [
-        _Phase(lambda s, m: along(s, -0.65, 0.11), _CLOSE, tolerance=0.025),
-        _Phase(lambda s, m: along(s, -0.65, 0.03), _CLOSE, tolerance=0.008),
-        _Phase(lambda s, m: along(s, 0.30, 0.03), _CLOSE),
+        Phase(lambda s, m: along(s, -0.65, 0.11), CLOSE, tolerance=0.025),
+        Phase(lambda s, m: along(s, -0.65, 0.03), CLOSE, tolerance=0.008),
+        Phase(lambda s, m: along(s, 0.30, 0.03), CLOSE),
     ]
 
 
-_SCRIPTS: dict[str, Callable[..., list[_Phase]]] = {"On": _put_on, "Open": _pull_open, "TurnOn": _push_on}
-
-
-def _body(scene: SceneBatch, name: str) -> np.ndarray:
-    return scene.xpos[:, scene.model.body(f"{name}/").id]
-
-
-def _tcp(scene: SceneBatch) -> np.ndarray:
-    return scene.site_xpos[:, scene.model.site("panda/tcp").id].copy()
+_SCRIPTS: dict[str, Callable[..., list[Phase]]] = {"On": _put_on, "Open": _pull_open, "TurnOn": _push_on}

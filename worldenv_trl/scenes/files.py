@@ -40,14 +40,20 @@ class FileTask(Task):
         return _scene(self)[1]
 
     @property
+    def entities(self) -> dict[str, Primitive]:
+        """Every fixture and object by name, the workspace excepted."""
+        return _scene(self)[0]
+
+    @property
     def relations(self) -> Relations:
+        """What judges the goal."""
         return _relations(self)
 
     def evaluate(self, scene: SceneBatch) -> np.ndarray:
         return self.relations.holds(scene)
 
     def paint(self, model: mujoco.MjModel, qpos: np.ndarray) -> None:
-        for name, entity in _scene(self)[0].items():
+        for name, entity in self.entities.items():
             if isinstance(entity, Stove):
                 entity.paint(model, name, qpos)
 

@@ -67,12 +67,10 @@ class Relations:
         self.origin = np.array((*origin, 0.0))
         self._data = mujoco.MjData(model)
         for predicate, *arguments in problem.goal:
-            if predicate not in ("On", "In") and (predicate, self._part(arguments[0])[1]) not in self._states(
-                arguments
-            ):
+            if predicate not in ("On", "In") and (predicate, self.part(arguments[0])[1]) not in self._states(arguments):
                 raise ValueError(f"{problem.source}: ({predicate} {arguments[0]}) in :goal: it has no such joint")
             if predicate in ("On", "In"):
-                self._part(arguments[1])
+                self.part(arguments[1])
                 if arguments[0] not in entities:
                     raise ValueError(f"{problem.source}: ({predicate} {arguments[0]} ...) in :goal: not a thing")
 
@@ -89,18 +87,16 @@ class Relations:
             return self._on(scene, *arguments)
         if predicate == "In":
             return self._in(scene, *arguments)
-        thing, part = self._part(arguments[0])
+        thing, part = self.part(arguments[0])
         state = self.entities[thing].states[predicate, part]
         position = scene.qpos[:, self.model.joint(f"{thing}/{state.joint}").qposadr[0]]
         return (state.low <= position) & (position <= state.high)
 
-    # ------------------------------------------------------------------------------------------------- arguments
-
     def _states(self, arguments: list[str]) -> Mapping:
-        thing, _ = self._part(arguments[0])
+        thing, _ = self.part(arguments[0])
         return self.entities[thing].states if thing in self.entities else {}
 
-    def _part(self, name: str) -> tuple[str, str]:
+    def part(self, name: str) -> tuple[str, str]:
         """The entity, or workspace, and its region (or "") that ``name`` means."""
         if name in self.entities:
             return name, ""
@@ -116,7 +112,7 @@ class Relations:
     def _position(self, scene: SceneBatch, thing: str) -> np.ndarray:
         return scene.xpos[:, self.model.body(f"{thing}/").id]
 
-    def _box(self, scene: SceneBatch, thing: str, part: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def box(self, scene: SceneBatch, thing: str, part: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Centre ``[n, 3]``, axes ``[n, 3, 3]`` and half size ``[3]`` of a region."""
         if thing in self.entities:
             site = self.model.site(f"{thing}/{part}").id
@@ -131,19 +127,19 @@ class Relations:
     # ------------------------------------------------------------------------------------------------- On, In
 
     def _on(self, scene: SceneBatch, top: str, below: str) -> np.ndarray:
-        thing, part = self._part(below)
+        thing, part = self.part(below)
         if not part:
             offset = self._position(scene, top) - self._position(scene, thing)
             near = (offset[:, 2] >= 0) & (np.hypot(offset[:, 0], offset[:, 1]) < ON_DISTANCE)
             return self._touching(scene, near, top, thing)
-        near = within(self._position(scene, top), *self._box(scene, thing, part))
+        near = within(self._position(scene, top), *self.box(scene, thing, part))
         return near if thing not in self.entities else self._touching(scene, near, top, thing)
 
     def _in(self, scene: SceneBatch, thing: str, place: str) -> np.ndarray:
-        owner, part = self._part(place)
+        owner, part = self.part(place)
         if owner in self.entities and not part:
             part = "contain_region"
-        return inside(self._position(scene, thing), *self._box(scene, owner, part))
+        return inside(self._position(scene, thing), *self.box(scene, owner, part))
 
     def _touching(self, scene: SceneBatch, rows: np.ndarray, first: str, second: str) -> np.ndarray:
         """Those of ``rows [n]`` in which two things are in contact; contacts are searched in no other row."""

@@ -31,6 +31,18 @@ class Region:
 
 
 @dataclass(frozen=True)
+class Grasp:
+    """Where the hand, pointing down with its fingers along the thing's y axis, closes around it.
+
+    ``offset`` is from the thing's origin to the point between the fingertips; ``release`` is how far above its place
+    the thing is let go.
+    """
+
+    offset: tuple[float, float, float]
+    release: float = 0.0
+
+
+@dataclass(frozen=True)
 class JointState:
     """A named state of a joint: the interval of positions in which it holds, and the one that initial states draw."""
 
@@ -48,6 +60,7 @@ class Primitive(composer.Entity):
         footprint: half sizes along x and y that are kept free instead, of things that are not round.
         height: of its highest point at rest.
         surface: height of what stands on it.
+        grasp: how it is picked up; None for what is not.
         regions: by name, see :class:`Region`; each is a box site of that name.
         states: ``(predicate, part)`` to :class:`JointState`; the part is a region's name, or empty for the whole.
     """
@@ -55,6 +68,7 @@ class Primitive(composer.Entity):
     radius: float = 0.05
     footprint: tuple[float, float] | None = None
     height: float = 0.05
+    grasp: Grasp | None = None
 
     @property
     def surface(self) -> float:

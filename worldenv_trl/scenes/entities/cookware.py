@@ -8,30 +8,30 @@ import mujoco
 import numpy as np
 from dm_control import mjcf
 
-from worldenv_trl.scenes.entities.base import GHOST, JointState, Primitive
+from worldenv_trl.scenes.entities.base import GHOST, Grasp, JointState, Primitive
 
 
 class FryingPan(Primitive):
-    """A pan, 0.17 m across, with a long handle towards +y; graspable by the handle."""
+    """A pan, 0.17 m across, with a long handle towards +x; graspable by the handle."""
 
-    radius, height = 0.13, 0.035
-    footprint = (0.085, 0.21)
-    HANDLE = (0.0, 0.155, 0.030)
+    radius, height = 0.13, 0.037
+    footprint = (0.21, 0.085)
+    grasp = Grasp((0.125, 0.0, 0.030))
 
     def _shape(self, body: mjcf.Element) -> None:
         iron, inside = {"rgba": (0.16, 0.16, 0.18, 1)}, {"rgba": (0.42, 0.43, 0.46, 1)}
         self._disc(body, 0.078, 0.0, 0.006, mass=0.20, **iron)
         self._disc(body, 0.070, 0.0005, 0.0066, **GHOST, **inside)
-        self._ring(body, 0.076, 0.083, 0.0, self.height, mass=0.008, **iron)
-        self._box(body, (0, 0.145, 0.030), (0.009, 0.065, 0.007), mass=0.05, rgba=(0.60, 0.28, 0.12, 1))
+        self._ring(body, 0.076, 0.083, 0.0, 0.035, mass=0.008, **iron)
+        self._box(body, (0.145, 0, 0.030), (0.065, 0.009, 0.007), mass=0.05, rgba=(0.60, 0.28, 0.12, 1))
         self._mark(body, "center", (0, 0, 0))
-        self._mark(body, "handle", self.HANDLE)
 
 
 class MokaPot(Primitive):
-    """A coffee maker: waisted, with a handle towards +y; graspable around its waist."""
+    """A coffee maker: waisted, with a handle towards +x; graspable around its upper half."""
 
     radius, height = 0.06, 0.130
+    grasp = Grasp((0.0, 0.0, 0.100))
 
     def _shape(self, body: mjcf.Element) -> None:
         steel, black = {"rgba": (0.72, 0.74, 0.78, 1)}, {"rgba": (0.10, 0.10, 0.11, 1)}
@@ -40,8 +40,8 @@ class MokaPot(Primitive):
         self._disc(body, 0.034, 0.068, 0.115, mass=0.08, **steel)
         self._disc(body, 0.010, 0.115, 0.130, mass=0.005, **black)
         for z in (0.075, 0.108):
-            self._box(body, (0, 0.045, z), (0.005, 0.014, 0.004), mass=0.005, **black)
-        self._box(body, (0, 0.057, 0.088), (0.006, 0.005, 0.024), mass=0.01, **black)
+            self._box(body, (0.045, 0, z), (0.014, 0.005, 0.004), mass=0.005, **black)
+        self._box(body, (0.057, 0, 0.088), (0.005, 0.006, 0.024), mass=0.01, **black)
         self._mark(body, "center", (0, 0, 0))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dm_control import mjcf
 
-from worldenv_trl.scenes.entities.base import GHOST, Color, Primitive
+from worldenv_trl.scenes.entities.base import GHOST, Color, Grasp, Primitive
 
 WHITE: Color = (0.95, 0.95, 0.95, 1)
 
@@ -14,6 +14,7 @@ class Can(Primitive):
 
     RADIUS = 0.032
     radius, height = 0.036, 0.085
+    grasp = Grasp((0.0, 0.0, 0.055))
 
     def _shape(self, body: mjcf.Element, label: Color = (0.80, 0.10, 0.10, 1), band: Color = WHITE) -> None:
         top = self.height
@@ -24,26 +25,25 @@ class Can(Primitive):
 
 
 class Packet(Primitive):
-    """A box that lies flat, its long side along y, with a stripe across it.
+    """A box that lies flat, its long side along x, with a stripe across it.
 
-    ``size`` is (depth, length, height).
+    ``size`` is (length, depth, height).
     """
 
     def _shape(
         self,
         body: mjcf.Element,
-        size: tuple[float, float, float] = (0.05, 0.09, 0.035),
+        size: tuple[float, float, float] = (0.09, 0.05, 0.035),
         color: Color = WHITE,
         stripe: Color = (0.1, 0.3, 0.8, 1),
         mass: float = 0.12,
     ) -> None:
-        depth, length, height = size
-        self.radius, self.height = 0.5 * (depth**2 + length**2) ** 0.5, height
-        self.footprint = (depth / 2, length / 2)
-        self._box(body, (0, 0, height / 2), (depth / 2, length / 2, height / 2), mass=mass, rgba=color)
-        self._box(
-            body, (0, 0, height / 2), (depth / 2 + 0.0006, 0.18 * length, height / 2 + 0.0006), **GHOST, rgba=stripe
-        )  # fmt: skip
+        length, depth, height = half = tuple(value / 2 for value in size)
+        self.radius, self.height, self.footprint = (length**2 + depth**2) ** 0.5, size[2], half[:2]
+        if size[1] < 0.075:  # else it is wider than the hand opens
+            self.grasp = Grasp((0.0, 0.0, 0.6 * size[2]), release=0.035)
+        self._box(body, (0, 0, height), half, mass=mass, rgba=color)
+        self._box(body, (0, 0, height), (0.36 * length, depth + 0.0006, height + 0.0006), **GHOST, rgba=stripe)
         self._mark(body, "center", (0, 0, 0))
 
 
@@ -52,6 +52,7 @@ class Carton(Primitive):
 
     HALF = 0.030
     radius, height = 0.045, 0.135
+    grasp = Grasp((0.0, 0.0, 0.080))
     footprint = (HALF, HALF)
 
     def _shape(self, body: mjcf.Element, color: Color = WHITE, label: Color = (0.1, 0.35, 0.85, 1)) -> None:
@@ -80,6 +81,7 @@ class Bottle(Primitive):
     ) -> None:
         shoulder, neck, top = (0.135, 0.185, 0.200) if tall else (0.095, 0.125, 0.142)
         self.height = top
+        self.grasp = Grasp((0.0, 0.0, top - 0.024))  # by the neck: the palm has no room for it
         self._disc(body, self.RADIUS, 0.0, shoulder, mass=0.24, rgba=glass)
         self._disc(body, self.RADIUS + 0.0006, 0.25 * shoulder, 0.75 * shoulder, **GHOST, rgba=label)
         self._disc(body, 0.62 * self.RADIUS, shoulder, 0.5 * (shoulder + neck), mass=0.01, rgba=glass)
@@ -89,18 +91,16 @@ class Bottle(Primitive):
 
 
 class Book(Primitive):
-    """A book that stands on its lower edge, cover towards x; thin enough to be gripped across the spine."""
+    """A book that stands on its lower edge, cover towards y; thin enough to be gripped across the spine."""
 
     THICKNESS, WIDTH = 0.030, 0.090
     radius, height = 0.05, 0.130
-    footprint = (THICKNESS / 2, WIDTH / 2)
+    footprint = (WIDTH / 2, THICKNESS / 2)
+    grasp = Grasp((0.0, 0.0, 0.100))
 
     def _shape(self, body: mjcf.Element, cover: Color = (0.10, 0.10, 0.13, 1)) -> None:
-        half = (self.THICKNESS / 2, self.WIDTH / 2, self.height / 2)
-        self._box(body, (0, 0, half[2]), half, mass=0.25, rgba=cover)
-        self._box(
-            body, (0, 0.0015, half[2] + 0.0006), (half[0] - 0.004, half[1], half[2]), **GHOST, rgba=(0.93, 0.9, 0.8, 1)
-        )  # fmt: skip
-        title = (0, 0, 0.70 * self.height)
-        self._box(body, title, (half[0] + 0.0006, 0.6 * half[1], 0.012), **GHOST, rgba=(0.85, 0.7, 0.2, 1))
+        x, y, z = self.WIDTH / 2, self.THICKNESS / 2, self.height / 2
+        self._box(body, (0, 0, z), (x, y, z), mass=0.25, rgba=cover)
+        self._box(body, (0.0015, 0, z + 0.0006), (x, y - 0.004, z), **GHOST, rgba=(0.93, 0.9, 0.8, 1))
+        self._box(body, (0, 0, 1.4 * z), (0.6 * x, y + 0.0006, 0.012), **GHOST, rgba=(0.85, 0.7, 0.2, 1))
         self._mark(body, "center", (0, 0, 0))

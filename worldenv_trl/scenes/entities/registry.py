@@ -51,13 +51,13 @@ CATEGORIES: Mapping[str, Category] = MappingProxyType(
         # groceries
         "alphabet_soup": _as(Can, label=(0.82, 0.10, 0.10, 1), band=_WHITE),
         "tomato_sauce": _as(Can, label=(0.12, 0.45, 0.16, 1), band=(0.85, 0.12, 0.08, 1)),
-        "cream_cheese": _as(Packet, size=(0.045, 0.080, 0.034), color=(0.92, 0.94, 0.97, 1), stripe=(0.1, 0.3, 0.8, 1)),
-        "butter": _as(Packet, size=(0.040, 0.090, 0.034), color=(0.96, 0.86, 0.30, 1), stripe=(0.85, 0.15, 0.1, 1)),
+        "cream_cheese": _as(Packet, size=(0.080, 0.045, 0.034), color=(0.92, 0.94, 0.97, 1), stripe=(0.1, 0.3, 0.8, 1)),
+        "butter": _as(Packet, size=(0.090, 0.040, 0.034), color=(0.96, 0.86, 0.30, 1), stripe=(0.85, 0.15, 0.1, 1)),
         "chocolate_pudding": _as(
-            Packet, size=(0.060, 0.075, 0.036), color=(0.33, 0.18, 0.10, 1), stripe=(0.93, 0.85, 0.70, 1)
+            Packet, size=(0.075, 0.060, 0.036), color=(0.33, 0.18, 0.10, 1), stripe=(0.93, 0.85, 0.70, 1)
         ),
         "cookies": _as(
-            Packet, size=(0.100, 0.070, 0.034), color=(0.80, 0.16, 0.14, 1), stripe=(0.95, 0.80, 0.35, 1), mass=0.3
+            Packet, size=(0.070, 0.100, 0.034), color=(0.80, 0.16, 0.14, 1), stripe=(0.95, 0.80, 0.35, 1), mass=0.3
         ),
         "milk": _as(Carton, color=_WHITE, label=(0.10, 0.35, 0.85, 1)),
         "orange_juice": _as(Carton, color=(0.97, 0.92, 0.80, 1), label=(0.98, 0.55, 0.05, 1)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dm_control import mjcf
 
-from worldenv_trl.scenes.entities.base import GHOST, Color, Primitive
+from worldenv_trl.scenes.entities.base import GHOST, Color, Grasp, Primitive
 
 
 class Bowl(Primitive):
@@ -28,6 +28,8 @@ class Bowl(Primitive):
         scale: float = 1.0,
     ) -> None:
         foot, self.radius = scale * self.FOOT_RADIUS, scale * self.radius
+        # Deep enough that the pads carry the bowl level.
+        self.grasp = Grasp((0.0, scale * self.RIM_RADIUS - 0.004, self.HEIGHT - 0.022))
         self._disc(body, foot, 0.0, 0.008, name="foot", mass=0.03, rgba=inside)
         self._ring(body, foot, scale * self.RIM_RADIUS, 0.0, self.HEIGHT, mass=0.006, rgba=outside)
         self._mark(body, "center", (0, 0, 0))
@@ -65,10 +67,11 @@ class Ramekin(Primitive):
 
 
 class Mug(Primitive):
-    """A mug, 0.066 m across, with a handle towards +y; graspable around its body."""
+    """A mug, 0.066 m across, with a handle towards +x; graspable around its body."""
 
     RADIUS = 0.033
     radius, height = 0.05, 0.085
+    grasp = Grasp((0.0, 0.0, 0.055))
 
     def _shape(
         self,
@@ -86,6 +89,6 @@ class Mug(Primitive):
             )  # fmt: skip
         handle = {"rgba": outside if band is None else band, "mass": 0.005}
         for z in (0.022, 0.063):
-            self._box(body, (0, radius + 0.010, z), (0.004, 0.012, 0.004), **handle)
-        self._box(body, (0, radius + 0.020, 0.0425), (0.004, 0.004, 0.024), **handle)
+            self._box(body, (radius + 0.010, 0, z), (0.012, 0.004, 0.004), **handle)
+        self._box(body, (radius + 0.020, 0, 0.0425), (0.004, 0.004, 0.024), **handle)
         self._mark(body, "center", (0, 0, 0))
