@@ -52,7 +52,7 @@ class Carton(Primitive):
 
     HALF = 0.030
     radius, height = 0.045, 0.135
-    grasp = Grasp((0.0, 0.0, 0.080))
+    grasp = Grasp((0.0, 0.0, 0.070))
     footprint = (HALF, HALF)
 
     def _shape(self, body: mjcf.Element, color: Color = WHITE, label: Color = (0.1, 0.35, 0.85, 1)) -> None:
