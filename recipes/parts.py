@@ -59,6 +59,14 @@ def check_config(config: WorldEnvConfig) -> None:
         raise ValueError(
             f"explore.scale_factors must be one number or more, none negative, got {config.explore.scale_factors}"
         )
+    for name, value in (
+        ("world_model.failure_share", config.world_model.failure_share),
+        ("world_model.holdout", config.world_model.holdout),
+        ("reflector.imagined_share", config.reflector.imagined_share),
+        ("reflector.holdout", config.reflector.holdout),
+    ):
+        if value is not None and not 0 <= value <= 1:
+            raise ValueError(f"{name} must lie between 0 and 1, got {value}")
     if not all(floor > 0 for floor in config.scale_floor):
         raise ValueError(f"scale_floor must be positive, got {config.scale_floor}")
     if config.image_size < 32 or config.image_size % 16:

@@ -59,6 +59,7 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"image_size": 50}, "multiple of 16 px"),
         ({"tasks": GOAL_TASKS[:1] * 2}, "names a task twice"),
         ({"rounds": 0}, "rounds must be at least 1, got 0"),
+        ({"world_model": WorldModel(failure_share=1.5)}, "world_model.failure_share must lie between 0 and 1, got 1.5"),
         ({"train_states": 0}, "train_states must be at least 1, got 0"),
         ({"num_threads": 0}, "num_threads must be at least 1"),
         ({"demonstrate": Demonstrate(episodes_per_task=0)}, "demonstrate.episodes_per_task must be at least 1"),

@@ -12,6 +12,7 @@ import numpy as np
 from worldenv_trl.scenes.bddl import Problem, Region
 from worldenv_trl.scenes.entities import CATEGORIES, Primitive
 from worldenv_trl.scenes.entities.registry import WORKSPACES
+from worldenv_trl.scenes.settings import part_of
 
 GAP = 0.002  # between footprints, m
 DROP = 0.001  # things start this much above what carries them
@@ -64,8 +65,8 @@ class Layout:
             if predicate in ("On", "In"):
                 self._place(first, rest[0])
             else:
-                thing, part = self._owner(first)
-                if (predicate, part) not in entities[thing].states:
+                thing, part = part_of(problem, entities, first)
+                if thing not in entities or (predicate, part) not in entities[thing].states:
                     raise ValueError(f"{problem.source}: ({predicate} {first}) in :init: it has no such joint")
                 self._joints.append((predicate, thing, part))
         self._order()
@@ -79,21 +80,10 @@ class Layout:
                 raise ValueError(f"{self.problem.source}: region {place} has no (:ranges ...) to place {thing} in")
             self._on_table.append((thing, region))
         else:
-            self._carried.append((thing, *self._owner(place)))
+            self._carried.append((thing, *part_of(self.problem, self.entities, place)))
 
     def _category(self, name: str) -> str:
         return {**self.problem.fixtures, **self.problem.objects}[name]
-
-    def _owner(self, name: str) -> tuple[str, str]:
-        """The entity and its region (or "") that ``name`` means."""
-        if name in self.entities:
-            return name, ""
-        region = self.problem.regions[name]
-        part = name.removeprefix(f"{region.target}_")
-        if part not in self.entities[region.target].regions:
-            known = ", ".join(self.entities[region.target].regions) or "none"
-            raise ValueError(f"{self.problem.source}: {region.target} has no region {part!r}; it has {known}")
-        return region.target, part
 
     def _order(self) -> None:
         """Carriers before what they carry."""

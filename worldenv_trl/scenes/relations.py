@@ -14,6 +14,7 @@ import numpy as np
 
 from worldenv_trl.scenes.bddl import Problem
 from worldenv_trl.scenes.entities import Primitive
+from worldenv_trl.scenes.settings import part_of
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.simulation import SceneBatch
@@ -66,13 +67,15 @@ class Relations:
         self.problem, self.entities, self.model = problem, entities, model
         self.origin = np.array((*origin, 0.0))
         self._data = mujoco.MjData(model)
-        for predicate, *arguments in problem.goal:
-            if predicate not in ("On", "In") and (predicate, self.part(arguments[0])[1]) not in self._states(arguments):
-                raise ValueError(f"{problem.source}: ({predicate} {arguments[0]}) in :goal: it has no such joint")
+        for predicate, first, *rest in problem.goal:
             if predicate in ("On", "In"):
-                self.part(arguments[1])
-                if arguments[0] not in entities:
-                    raise ValueError(f"{problem.source}: ({predicate} {arguments[0]} ...) in :goal: not a thing")
+                self.part(rest[0])
+                if first not in entities:
+                    raise ValueError(f"{problem.source}: ({predicate} {first} ...) in :goal: not a thing")
+                continue
+            thing, part = self.part(first)
+            if thing not in entities or (predicate, part) not in entities[thing].states:
+                raise ValueError(f"{problem.source}: ({predicate} {first}) in :goal: it has no such joint")
 
     def holds(self, scene: SceneBatch) -> np.ndarray:
         """``[n]`` bool: the whole goal holds in the current state of each row."""
@@ -92,22 +95,9 @@ class Relations:
         position = scene.qpos[:, self.model.joint(f"{thing}/{state.joint}").qposadr[0]]
         return (state.low <= position) & (position <= state.high)
 
-    def _states(self, arguments: list[str]) -> Mapping:
-        thing, _ = self.part(arguments[0])
-        return self.entities[thing].states if thing in self.entities else {}
-
     def part(self, name: str) -> tuple[str, str]:
         """The entity, or workspace, and its region (or "") that ``name`` means."""
-        if name in self.entities:
-            return name, ""
-        region = self.problem.regions.get(name)
-        if region is None:
-            raise ValueError(f"{self.problem.source}: {name!r} in :goal is neither a thing nor a region")
-        part = name.removeprefix(f"{region.target}_")
-        if region.target in self.entities and part not in self.entities[region.target].regions:
-            known = ", ".join(self.entities[region.target].regions) or "none"
-            raise ValueError(f"{self.problem.source}: {region.target} has no region {part!r}; it has {known}")
-        return region.target, part
+        return part_of(self.problem, self.entities, name)
 
     def _position(self, scene: SceneBatch, thing: str) -> np.ndarray:
         return scene.xpos[:, self.model.body(f"{thing}/").id]

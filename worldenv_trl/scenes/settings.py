@@ -17,7 +17,7 @@ from worldenv_trl.scenes.entities import Primitive, make_entity
 from worldenv_trl.scenes.entities.base import Color
 from worldenv_trl.scenes.entities.registry import WORKSPACES
 
-__all__ = ["SETTINGS", "Setting", "compile_scene", "setting_of"]
+__all__ = ["SETTINGS", "Setting", "compile_scene", "part_of", "setting_of"]
 
 
 @dataclass(frozen=True)
@@ -89,3 +89,21 @@ def compile_scene(problem: Problem) -> tuple[dict[str, Primitive], mujoco.MjMode
                 raise ValueError(f"{problem.source}: {error}") from None
             add(entities[name])
     return entities, mujoco.MjModel.from_xml_string(arena.root.to_xml_string(), arena.root.get_assets())
+
+
+def part_of(problem: Problem, entities: Mapping[str, Primitive], name: str) -> tuple[str, str]:
+    """The entity, or workspace, and its region (or "") that ``name`` means.
+
+    Raises:
+        ValueError: if the entity has no such region, naming the file and the regions it has.
+    """
+    if name in entities:
+        return name, ""
+    if name not in problem.regions:
+        raise ValueError(f"{problem.source}: {name!r} is neither a thing nor a region here")
+    target = problem.regions[name].target
+    part = name.removeprefix(f"{target}_")
+    if target in entities and part not in entities[target].regions:
+        known = ", ".join(entities[target].regions) or "none"
+        raise ValueError(f"{problem.source}: {target} has no region {part!r}; it has {known}")
+    return target, part
