@@ -10,9 +10,9 @@ from pathlib import Path
 warnings.filterwarnings("ignore", message="Creating .*WeightUpdater")
 
 GOAL_TASKS = (
-    "goal/put_the_bowl_on_the_plate",
-    "goal/open_the_top_drawer",
-    "goal/turn_on_the_stove",
+    "starter/put_the_bowl_on_the_plate",
+    "starter/open_the_top_drawer",
+    "starter/turn_on_the_stove",
 )
 
 

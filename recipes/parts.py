@@ -29,7 +29,7 @@ PROPRIO = "commanded"  # the same in physics and imagination, so the policy meet
 def check_config(config: WorldEnvConfig) -> None:
     """Fails before any long work starts if a task is unknown, a setting impossible or no GL backend renders."""
     if not config.tasks:
-        raise ValueError("tasks is empty: name at least one task, for instance goal/open_the_top_drawer")
+        raise ValueError("tasks is empty: name at least one task, for instance starter/open_the_top_drawer")
     if len(set(config.tasks)) < len(config.tasks):
         raise ValueError(f"tasks names a task twice: {', '.join(config.tasks)}")
     for name, value, known in (

@@ -20,7 +20,7 @@ from worldenv_trl.keys import (
     SUCCESS,
 )
 
-DRAWER = "goal/open_the_top_drawer"
+DRAWER = "starter/open_the_top_drawer"
 C = 4
 
 

@@ -340,7 +340,7 @@ def test_unusable_settings_are_refused():
 
 
 def test_physics_and_imagination_have_the_same_interface():
-    real = chunked(TabletopEnv(list_tasks("goal")[0], 6, image_size=SIZE, proprio="commanded", seed=0), C)
+    real = chunked(TabletopEnv(list_tasks("starter")[0], 6, image_size=SIZE, proprio="commanded", seed=0), C)
     start = real.reset()
     env = ImaginedEnv(CountingWorldModel(), FK, start, [2, 3], max_steps=C, chunk_length=C)
 

@@ -15,7 +15,7 @@ from worldenv_trl.envs import ImaginedEnv, Reflect, TabletopEnv, chunked
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.reflectors import Reflector
 
-TASK = "goal/open_the_top_drawer"
+TASK = "starter/open_the_top_drawer"
 
 
 class Brightness(Reflector):

@@ -24,7 +24,7 @@ from worldenv_trl.keys import (
 )
 from worldenv_trl.scenes import list_tasks, load_task
 
-TASKS = list_tasks("goal")
+TASKS = list_tasks("starter")
 BOWL, DRAWER, STOVE = TASKS
 SHOWN = (IMAGE, STATE, KINEMATIC_STATE, NUM_STEPS, SUCCESS, CONTEXT_ID, SIM_STATE, "reward", "done", "truncated")
 
@@ -307,7 +307,7 @@ def test_actions_are_clipped():
 @pytest.mark.parametrize(
     ("task", "options", "message"),
     [
-        ("goal/open_the_top_drawr", {}, "did you mean 'goal/open_the_top_drawer'"),
+        ("goal/open_the_top_drawr", {}, "did you mean 'starter/open_the_top_drawer'"),
         ([], {}, "task is empty"),
         ([DRAWER, DRAWER], {}, "named twice"),
         (TASKS, {}, "3 tasks need at least 3 rows, got num_envs=2"),

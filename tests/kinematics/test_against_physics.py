@@ -14,7 +14,7 @@ from worldenv_trl.scenes.expert import ScriptedExpert
 
 FK = ForwardKinematics()
 ROWS = 8
-TASKS = list_tasks("goal")
+TASKS = list_tasks("starter")
 
 
 @lru_cache

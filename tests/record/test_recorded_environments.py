@@ -9,7 +9,7 @@ from worldenv_trl.data import episodes_from_rollouts, policy_samples
 from worldenv_trl.envs import TabletopEnv, chunked
 from worldenv_trl.record import RolloutWriter, read_rollouts
 
-TASKS = ["goal/open_the_top_drawer", "goal/turn_on_the_stove"]
+TASKS = ["starter/open_the_top_drawer", "starter/turn_on_the_stove"]
 
 
 def collect(frames: bool):

@@ -234,14 +234,14 @@ def test_metadata_and_attachments_come_before_the_rollouts(tmp_path):
 
 
 def test_a_task_selects_its_rollouts(tmp_path):
-    tasks = ["goal/open_the_top_drawer", "goal/turn_on_the_stove"]
+    tasks = ["starter/open_the_top_drawer", "starter/turn_on_the_stove"]
     from worldenv_trl.scenes import load_task
 
     parts = [step_rollouts([6, 3], seed=i, task=load_task(name).task_id) for i, name in enumerate(tasks)]
     write(tmp_path / "a.mcap", *parts, metadata={"tasks": tasks})
     assert_same(read_rollouts(tmp_path / "a.mcap", task=tasks[1]), parts[1])
-    with pytest.raises(ValueError, match=r"a\.mcap is of goal/open_the_top_drawer, .*not of goal/put"):
-        read_rollouts(tmp_path / "a.mcap", task="goal/put_the_bowl_on_the_plate")
+    with pytest.raises(ValueError, match=r"a\.mcap is of starter/open_the_top_drawer, .*not of goal/put"):
+        read_rollouts(tmp_path / "a.mcap", task="starter/put_the_bowl_on_the_plate")
     write(tmp_path / "b.mcap", parts[0])
     with pytest.raises(ValueError, match="does not say of which tasks"):
         read_rollouts(tmp_path / "b.mcap", task=tasks[0])

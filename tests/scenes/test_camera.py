@@ -41,7 +41,7 @@ def test_what_a_camera_looks_at_is_in_the_middle():
 
 
 def test_the_task_s_camera_is_the_model_s():
-    task = load_task("goal/put_the_bowl_on_the_plate")
+    task = load_task("starter/put_the_bowl_on_the_plate")
     camera, model = task.camera("agentview"), task.build()
     assert isinstance(camera, Camera)
     data = mujoco.MjData(model)

@@ -15,7 +15,7 @@ def random_q(n):
 
 
 def test_forward_kinematics_and_jacobian_equal_mujoco_s():
-    model = load_task("goal/open_the_top_drawer").build()
+    model = load_task("starter/open_the_top_drawer").build()
     data = mujoco.MjData(model)
     site = model.site("panda/tcp").id
     columns = [model.jnt_dofadr[model.joint(f"panda/{joint.name}").id] for joint in panda.JOINTS]

@@ -9,7 +9,7 @@ import pytest
 
 from worldenv_trl.scenes import SceneBatch, ScriptedExpert, list_tasks, load_task
 
-NAMES = list_tasks("goal")
+NAMES = list_tasks("starter")
 
 
 def _scene(name: str, rows: int, split: str = "train", skip: int = 0) -> SceneBatch:

@@ -11,7 +11,7 @@ from worldenv_trl.scenes.entities.cookware import Stove
 from worldenv_trl.scenes.entities.storage import Cabinet
 from worldenv_trl.scenes.entities.tableware import Bowl, Plate
 
-BOWL, DRAWER, STOVE = "goal/put_the_bowl_on_the_plate", "goal/open_the_top_drawer", "goal/turn_on_the_stove"
+BOWL, DRAWER, STOVE = "starter/put_the_bowl_on_the_plate", "starter/open_the_top_drawer", "starter/turn_on_the_stove"
 GRIP = Bowl.HEIGHT - 0.022
 ABOVE = np.array([0.0, 0.0, 0.12])
 

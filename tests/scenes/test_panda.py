@@ -6,7 +6,7 @@ import pytest
 
 from worldenv_trl.scenes import SceneBatch, controller, load_task, panda
 
-MODEL = load_task("goal/open_the_top_drawer").build()
+MODEL = load_task("starter/open_the_top_drawer").build()
 
 
 def test_the_tcp_of_a_known_pose_is_where_the_datasheet_puts_it():
@@ -42,7 +42,7 @@ def test_urdf_names_every_joint_and_ends_at_the_tcp():
 
 
 def test_the_servos_hold_the_arm_still_for_two_seconds():
-    task = load_task("goal/open_the_top_drawer")
+    task = load_task("starter/open_the_top_drawer")
     scene = SceneBatch(task, 1, cameras=())
     scene.reset([0], task.init_states("train", 1))
     before = scene.measured_state()
@@ -53,7 +53,7 @@ def test_the_servos_hold_the_arm_still_for_two_seconds():
 
 
 def test_the_gripper_closes_and_opens_at_its_rate():
-    task = load_task("goal/open_the_top_drawer")
+    task = load_task("starter/open_the_top_drawer")
     scene = SceneBatch(task, 1, cameras=())
     scene.reset([0], task.init_states("train", 1))
     close = np.zeros((1, 7))

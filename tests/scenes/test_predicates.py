@@ -13,7 +13,7 @@ from worldenv_trl.scenes.entities.cookware import Stove
 from worldenv_trl.scenes.entities.storage import Cabinet
 from worldenv_trl.scenes.entities.tableware import Plate
 
-BOWL, DRAWER, STOVE = "goal/put_the_bowl_on_the_plate", "goal/open_the_top_drawer", "goal/turn_on_the_stove"
+BOWL, DRAWER, STOVE = "starter/put_the_bowl_on_the_plate", "starter/open_the_top_drawer", "starter/turn_on_the_stove"
 
 
 def _scene(name: str, rows: int) -> SceneBatch:

@@ -19,7 +19,7 @@ def test_shrinking_takes_the_rounded_mean_of_each_block():
 
 
 def test_edges_are_smooth_and_everything_is_where_it_belongs():
-    task = load_task("goal/turn_on_the_stove")
+    task = load_task("starter/turn_on_the_stove")
     scene = SceneBatch(task, 1, num_threads=1)
     scene.reset(np.array([0]), task.init_states("train", 1))
     image = scene.render()["agentview"][0].transpose(1, 2, 0).astype(float)

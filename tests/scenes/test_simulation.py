@@ -8,7 +8,7 @@ import pytest
 
 from worldenv_trl.scenes import SceneBatch, ScriptedExpert, list_tasks, load_task
 
-TASKS = list_tasks("goal")
+TASKS = list_tasks("starter")
 RNG = np.random.default_rng(0)
 
 
@@ -127,7 +127,7 @@ def test_images_do_not_depend_on_the_number_of_threads():
 
 
 def test_the_burner_glows_in_the_rows_where_the_stove_is_on():
-    scene = make("goal/turn_on_the_stove", 2, cameras=("agentview",))
+    scene = make("starter/turn_on_the_stove", 2, cameras=("agentview",))
     joint = scene.model.jnt_qposadr[scene.model.joint("stove/lever").id]
     state = scene.sim_state()
     scene.qpos[1, joint] = 1.4

@@ -8,7 +8,7 @@ import pytest
 from worldenv_trl.scenes import SceneBatch, list_suites, list_tasks, load_task, tasks
 from worldenv_trl.scenes.entities.cookware import Stove
 
-NAMES = list_tasks("goal")
+NAMES = list_tasks("starter")
 
 
 def _scene(name: str, states: np.ndarray, **options) -> SceneBatch:
@@ -19,7 +19,7 @@ def _scene(name: str, states: np.ndarray, **options) -> SceneBatch:
 
 def test_the_goal_suite_lists_its_tasks_in_the_order_of_their_ids():
     assert "goal" in list_suites()
-    assert NAMES == ["goal/put_the_bowl_on_the_plate", "goal/open_the_top_drawer", "goal/turn_on_the_stove"]
+    assert NAMES == ["starter/put_the_bowl_on_the_plate", "starter/open_the_top_drawer", "starter/turn_on_the_stove"]
     loaded = [load_task(name) for name in NAMES]
     assert [task.task_id for task in loaded] == [0, 1, 2]
     assert [task.name for task in loaded] == NAMES
@@ -29,8 +29,8 @@ def test_the_goal_suite_lists_its_tasks_in_the_order_of_their_ids():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: load_task("goal/turn_on_the_stve"), "did you mean 'goal/turn_on_the_stove'"),
-        (lambda: load_task("???"), "known tasks: goal/put_the_bowl_on_the_plate"),
+        (lambda: load_task("goal/turn_on_the_stve"), "did you mean 'starter/turn_on_the_stove'"),
+        (lambda: load_task("???"), "known tasks: starter/put_the_bowl_on_the_plate"),
         (lambda: list_tasks("gaol"), "unknown suite 'gaol': it must be one of goal"),
         (lambda: load_task(NAMES[0]).init_states("validation"), "'validation': it must be 'train' or 'test'"),
         (lambda: load_task(NAMES[0]).init_states("train", 0), "count must be at least 1, got 0"),
@@ -115,14 +115,14 @@ def test_the_camera_spends_a_pixel_on_nine_millimetres_or_less_across_the_scene(
 
 
 def test_the_model_is_compiled_once_and_holds_only_what_its_task_needs():
-    stove = load_task("goal/turn_on_the_stove")
+    stove = load_task("starter/turn_on_the_stove")
     assert stove.build() is stove.build()
     names = {stove.build().body(index).name for index in range(stove.build().nbody)}
     assert "stove/" in names and "bowl/" not in names and "cabinet/" not in names
 
 
 def test_the_burner_is_drawn_red_exactly_while_the_lever_is_on():
-    name = "goal/turn_on_the_stove"
+    name = "starter/turn_on_the_stove"
     states = np.repeat(load_task(name).init_states("train", 1), 3, axis=0)
     scene = _scene(name, states, cameras=("agentview",))
     lever = scene.model.jnt_qposadr[scene.model.joint("stove/lever").id]

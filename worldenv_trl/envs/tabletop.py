@@ -87,7 +87,7 @@ class TabletopEnv(EnvBase):
         RuntimeError: if images are asked for and no GL backend works.
 
     Examples:
-        >>> env = TabletopEnv("goal/open_the_top_drawer", 4, seed=0)
+        >>> env = TabletopEnv("starter/open_the_top_drawer", 4, seed=0)
         >>> rollout = env.rollout(3)
         >>> rollout["observation", "image"].shape
         torch.Size([4, 3, 3, 64, 64])
@@ -378,7 +378,7 @@ class TabletopEnv(EnvBase):
 
 def _check_counts(tasks: list[Task], num_envs: int, group_repeats: int) -> None:
     if not tasks:
-        raise ValueError("task is empty: name at least one, for instance 'goal/open_the_top_drawer'")
+        raise ValueError("task is empty: name at least one, for instance 'starter/open_the_top_drawer'")
     if len({task.name for task in tasks}) < len(tasks):
         raise ValueError(f"a task is named twice: {', '.join(task.name for task in tasks)}")
     if num_envs < 1 or group_repeats < 1 or num_envs % group_repeats:

@@ -57,7 +57,7 @@ class RolloutWriter:
         ValueError: for another suffix, or metadata that is not plain.
 
     Examples:
-        >>> with RolloutWriter("runs/demo.mcap", metadata={"task": "goal/open_the_top_drawer"}) as writer:
+        >>> with RolloutWriter("runs/demo.mcap", metadata={"task": "starter/open_the_top_drawer"}) as writer:
         ...     writer.write(env.rollout(64))
     """
 

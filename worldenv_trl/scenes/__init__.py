@@ -4,8 +4,9 @@ from worldenv_trl.scenes.rendering import RendererPool  # first: where GL is mis
 
 # isort: split
 from worldenv_trl.scenes.camera import Camera
+from worldenv_trl.scenes.catalogue import list_suites, list_tasks, load_task
 from worldenv_trl.scenes.expert import ScriptedExpert
 from worldenv_trl.scenes.simulation import SceneBatch
-from worldenv_trl.scenes.tasks import Task, list_suites, list_tasks, load_task
+from worldenv_trl.scenes.tasks import Task
 
 __all__ = ["Camera", "RendererPool", "SceneBatch", "ScriptedExpert", "Task", "list_suites", "list_tasks", "load_task"]

@@ -9,31 +9,32 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
 
-from worldenv_trl.scenes import panda
 from worldenv_trl.scenes.bddl import Problem, read_bddl
 from worldenv_trl.scenes.entities import Primitive
 from worldenv_trl.scenes.entities.cookware import Stove
+from worldenv_trl.scenes.initial import draw_poses, load_poses, states_from_poses
 from worldenv_trl.scenes.layout import Layout
 from worldenv_trl.scenes.relations import Relations
 from worldenv_trl.scenes.settings import compile_scene, setting_of
-from worldenv_trl.scenes.simulation import SceneBatch, home_state
-from worldenv_trl.scenes.tasks import SPLITS, Task
+from worldenv_trl.scenes.simulation import SceneBatch
+from worldenv_trl.scenes.tasks import Task
 
 __all__ = ["FileTask", "load_bddl"]
 
 MAX_STEPS = 300  # LIBERO's goal suite, in openvla-oft's protocol
 _FIRST_ID, _IDS = 1000, 9000
-_SETTLE_SUBSTEPS = 100
-_ATTEMPTS = 40
-_MOVED, _UPRIGHT = 0.04, 0.9  # metres; cosine of the tilt: a state that settles further away is drawn again
 
 
 @dataclass(frozen=True)
 class FileTask(Task):
-    """A task whose scene, initial states and goal come from a file; its number follows from the file's text."""
+    """A task whose scene, initial states and goal come from a file.
 
+    ``digest`` is the checksum of the file's text, ``states`` the file of stored initial states, if there is one.
+    """
+
+    digest: int = 0
+    states: Path | None = None
     problem: Problem | None = field(default=None, compare=False, repr=False)
 
     def build(self) -> mujoco.MjModel:
@@ -45,9 +46,19 @@ class FileTask(Task):
         return _scene(self)[0]
 
     @property
+    def layout(self) -> Layout:
+        """What draws initial states."""
+        return _layout(self)
+
+    @property
     def relations(self) -> Relations:
         """What judges the goal."""
         return _relations(self)
+
+    @property
+    def seed(self) -> int:
+        """Of the initial states: they stay the same when the catalogue is numbered anew."""
+        return self.digest
 
     def evaluate(self, scene: SceneBatch) -> np.ndarray:
         return self.relations.holds(scene)
@@ -59,11 +70,31 @@ class FileTask(Task):
 
     def init_states(self, split: str, count: int = 50) -> np.ndarray:
         self._check_split(split, count)
-        return _drawn_states(self, split, count).copy()
+        stored = _stored_states(self, split)[:count]
+        missing = count - len(stored)
+        return np.concatenate([stored, _drawn_states(self, split, len(stored), missing)]) if missing else stored.copy()
 
 
-def load_bddl(path: str | Path, *, max_steps: int = MAX_STEPS) -> FileTask:
+def load_bddl(
+    path: str | Path,
+    *,
+    max_steps: int = MAX_STEPS,
+    name: str | None = None,
+    suite: str = "file",
+    task_id: int | None = None,
+    states: Path | None = None,
+) -> FileTask:
     """The task of a BDDL file.
+
+    Args:
+        path: the file.
+
+    Keyword Args:
+        max_steps: of an episode.
+        name: the task's name; the path by default.
+        suite: the suite it belongs to.
+        task_id: its number; one that follows from the file's text by default.
+        states: a file of stored initial states.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -72,15 +103,17 @@ def load_bddl(path: str | Path, *, max_steps: int = MAX_STEPS) -> FileTask:
     """
     path = Path(path)
     problem = read_bddl(path)
+    digest = zlib.crc32(path.read_bytes())
     task = FileTask(
-        name=str(path),
-        suite="file",
-        task_id=_FIRST_ID + zlib.crc32(path.read_bytes()) % _IDS,
+        name=str(path) if name is None else name,
+        suite=suite,
+        task_id=_FIRST_ID + digest % _IDS if task_id is None else task_id,
         language=problem.language,
         goal=problem.goal,
-        placements=(),
         max_steps=max_steps,
         cameras=(setting_of(problem).camera,),
+        digest=digest,
+        states=states,
         problem=problem,
     )
     _layout(task), _relations(task)  # what cannot be laid out or judged fails here, not in the first reset
@@ -103,39 +136,12 @@ def _relations(task: FileTask) -> Relations:
 
 
 @cache
-def _drawn_states(task: FileTask, split: str, count: int) -> np.ndarray:
-    model, layout = task.build(), _layout(task)
-    things = np.array([model.body(f"{name}/").id for name in task.problem.objects])
-    batch = Batch(model, count, 2)
-    data = mujoco.MjData(model)
-    qpos, ctrl, targets = home_state(model, panda.HOME_Q)
-    waiting = np.arange(count, dtype=np.int32)
-    for attempt in range(_ATTEMPTS):
-        drawn = np.zeros((len(waiting), len(things), 3))
-        for row, index in enumerate(waiting):
-            # One generator per state and attempt: a larger count extends a smaller one.
-            rng = np.random.default_rng([task.task_id, SPLITS.index(split), int(index), attempt])
-            data.qpos[:] = qpos
-            layout.draw(data, rng)
-            mujoco.mj_kinematics(model, data)
-            drawn[row] = data.xpos[things]
-            for name, value in (
-                ("qpos", data.qpos), ("qvel", 0.0), ("mocap_pos", data.mocap_pos), ("mocap_quat", data.mocap_quat),
-                ("ctrl", ctrl), ("userdata", targets), ("qacc_warmstart", 0.0),
-            ):  # fmt: skip
-                batch.bind(name)[index] = value
-        batch.step(waiting, nstep=_SETTLE_SUBSTEPS)
-        batch.forward(waiting, stage=mujoco.mjtStage.mjSTAGE_POS.value)
-        moved = np.linalg.norm(batch.bind("xpos")[waiting][:, things] - drawn, axis=-1).max(-1, initial=0.0)
-        upright = batch.bind("xmat")[waiting][:, things].reshape(len(waiting), len(things), 9)[..., 8]
-        fine = (moved < _MOVED) & (upright.min(-1, initial=1.0) > _UPRIGHT)
-        waiting = waiting[~fine]
-        if not len(waiting):
-            break
-    else:
-        raise RuntimeError(
-            f"{task.name}: initial state {int(waiting[0])} does not come to rest in {_ATTEMPTS} tries: "
-            "something falls or is pushed away from its region in :init"
-        )
-    batch.bind("time")[:] = 0.0
-    return batch.state.copy()
+def _stored_states(task: FileTask, split: str) -> np.ndarray:
+    if task.states is None or not task.states.exists():
+        return np.zeros((0, SceneBatch(task, 1, cameras=()).batch.nstate))
+    return states_from_poses(task, load_poses(task, task.states)[split])
+
+
+@cache
+def _drawn_states(task: FileTask, split: str, start: int, count: int) -> np.ndarray:
+    return states_from_poses(task, draw_poses(task, split, start, count))

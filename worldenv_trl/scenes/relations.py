@@ -102,12 +102,16 @@ class Relations:
     def _position(self, scene: SceneBatch, thing: str) -> np.ndarray:
         return scene.xpos[:, self.model.body(f"{thing}/").id]
 
+    def half_size(self, thing: str, part: str) -> np.ndarray:
+        """Half size ``[3]`` of a region of a thing."""
+        return np.array(self.entities[thing].regions[part].half_size)
+
     def box(self, scene: SceneBatch, thing: str, part: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Centre ``[n, 3]``, axes ``[n, 3, 3]`` and half size ``[3]`` of a region."""
         if thing in self.entities:
             site = self.model.site(f"{thing}/{part}").id
             axes = scene.site_xmat[:, site].reshape(-1, 3, 3)
-            return scene.site_xpos[:, site], axes, np.array(self.entities[thing].regions[part].half_size)
+            return scene.site_xpos[:, site], axes, self.half_size(thing, part)
         low_x, low_y, high_x, high_y = self.problem.regions[f"{thing}_{part}"].ranges[0]  # LIBERO: the first one
         center = self.origin + np.array(((low_x + high_x) / 2, (low_y + high_y) / 2, 0.0))
         half = np.array(((high_x - low_x) / 2, (high_y - low_y) / 2, 0.0))

@@ -35,11 +35,13 @@ class Grasp:
     """Where the hand, pointing down with its fingers along the thing's y axis, closes around it.
 
     ``offset`` is from the thing's origin to the point between the fingertips; ``release`` is how far above its place
-    the thing is let go.
+    the thing is let go. ``kind``: ``across`` (the fingers stay along y), ``square`` (or along x), ``round`` (any way)
+    or ``rim`` (any point of a circle with the offset's radius, one finger inside and one outside).
     """
 
     offset: tuple[float, float, float]
     release: float = 0.0
+    kind: str = "across"
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class Primitive(composer.Entity):
         surface: height of what stands on it.
         grasp: how it is picked up; None for what is not.
         regions: by name, see :class:`Region`; each is a box site of that name.
+        juts: what else stands in the way of a hand, and may move: half sizes by the name of a box site.
         states: ``(predicate, part)`` to :class:`JointState`; the part is a region's name, or empty for the whole.
     """
 
@@ -79,6 +82,7 @@ class Primitive(composer.Entity):
         self._root.compiler.angle = "radian"
         self._root.default.geom.set_attributes(**SOLID)
         self.regions: dict[str, Region] = {}
+        self.juts: dict[str, tuple[float, float, float]] = {}
         self.states: dict[tuple[str, str], JointState] = {}
         self._shape(self._root.worldbody, **shape)
 
@@ -138,6 +142,10 @@ class Primitive(composer.Entity):
         body.add("site", name=name, type="box", pos=tuple(center), size=tuple(half_size), **INVISIBLE)
         owner = "" if body is self._root.worldbody else body.name
         self.regions[name] = Region(name, tuple(center), tuple(half_size), owner, on_top)
+
+    def _jut(self, body: mjcf.Element, name: str, center: Sequence[float], half_size: Sequence[float]) -> None:
+        body.add("site", name=name, type="box", pos=tuple(center), size=tuple(half_size), **INVISIBLE)
+        self.juts[name] = tuple(half_size)
 
     def _mark(self, body: mjcf.Element, name: str, position: Sequence[float]) -> None:
         """A point that others look for: a handle, a centre."""

@@ -30,15 +30,15 @@ class FryingPan(Primitive):
 class MokaPot(Primitive):
     """A coffee maker: waisted, with a handle towards +x; graspable around its upper half."""
 
-    radius, height = 0.06, 0.130
-    grasp = Grasp((0.0, 0.0, 0.100))
+    radius, height = 0.06, 0.124
+    grasp = Grasp((0.0, 0.0, 0.098))
 
     def _shape(self, body: mjcf.Element) -> None:
         steel, black = {"rgba": (0.72, 0.74, 0.78, 1)}, {"rgba": (0.10, 0.10, 0.11, 1)}
-        self._disc(body, 0.040, 0.0, 0.050, mass=0.22, **steel)
-        self._disc(body, 0.027, 0.050, 0.068, mass=0.03, **steel)
-        self._disc(body, 0.034, 0.068, 0.115, mass=0.08, **steel)
-        self._disc(body, 0.010, 0.115, 0.130, mass=0.005, **black)
+        self._disc(body, 0.040, 0.0, 0.050, mass=0.06, **steel)
+        self._disc(body, 0.027, 0.050, 0.068, mass=0.02, **steel)
+        self._disc(body, 0.034, 0.068, 0.115, mass=0.04, **steel)
+        self._disc(body, 0.010, 0.115, 0.124, mass=0.005, **black)
         for z in (0.075, 0.108):
             self._box(body, (0.045, 0, z), (0.014, 0.005, 0.004), mass=0.005, **black)
         self._box(body, (0.057, 0, 0.088), (0.005, 0.006, 0.024), mass=0.01, **black)
@@ -56,14 +56,14 @@ class Stove(Primitive):
     PIVOT = (-0.045, 0.0, 0.035)
     PEG_HEIGHT = 0.05
     START_ANGLE = -math.pi / 2  # direction of the lever (from +x) when off
-    BURNER = (0.075, 0.0)
+    BURNER, BURNER_RADIUS, COOKS_WITHIN = (0.075, 0.0), 0.055, 0.05
     radius, height = 0.18, 0.085
     footprint = (0.14, 0.12)
 
     def _shape(self, body: mjcf.Element) -> None:
         self._box(body, (0, 0, 0.0125), (0.14, 0.12, 0.0125), rgba=(0.78, 0.80, 0.83, 1))
         body.add(
-            "geom", name="burner", type="cylinder", pos=(*self.BURNER, 0.0275), size=(0.055, 0.003),
+            "geom", name="burner", type="cylinder", pos=(*self.BURNER, 0.0275), size=(self.BURNER_RADIUS, 0.003),
             rgba=(0.18, 0.18, 0.2, 1), contype=0, conaffinity=0,
         )  # fmt: skip
         lever = body.add("body", name="lever", pos=self.PIVOT, euler=(0, 0, self.START_ANGLE), gravcomp=1)
@@ -79,7 +79,9 @@ class Stove(Primitive):
             size=(0.013, self.PEG_HEIGHT / 2), mass=0.05, rgba=(0.95, 0.80, 0.1, 1),
         )  # fmt: skip
         self._mark(lever, "peg", (self.PEG_RADIUS, 0, self.PEG_HEIGHT / 2))
-        self._region(body, "cook_region", (*self.BURNER, 0.025), (0.05, 0.05, 0.002), on_top=True)
+        self._region(
+            body, "cook_region", (*self.BURNER, 0.025), (self.COOKS_WITHIN, self.COOKS_WITHIN, 0.002), on_top=True
+        )
         self.states["TurnOn", ""] = JointState("lever", self.ON_ABOVE, math.inf, (1.2, 1.6))
         self.states["TurnOff", ""] = JointState("lever", -math.inf, 0.2, (0.0, 0.0))
 
@@ -88,3 +90,10 @@ class Stove(Primitive):
         """The burner of stove ``name`` glows while it is on."""
         lit = qpos[model.joint(f"{name}/lever").qposadr[0]] >= cls.ON_ABOVE
         model.geom(f"{name}/burner").rgba = (1.0, 0.12, 0.05, 1) if lit else (0.18, 0.18, 0.2, 1)
+
+
+class WideStove(Stove):
+    """A stove whose lever stays clear of what stands on its burner, which takes two pots."""
+
+    PEG_RADIUS, PIVOT = 0.070, (-0.095, 0.0, 0.035)
+    BURNER, BURNER_RADIUS, COOKS_WITHIN = (0.055, 0.0), 0.075, 0.065

@@ -14,7 +14,7 @@ class Can(Primitive):
 
     RADIUS = 0.032
     radius, height = 0.036, 0.085
-    grasp = Grasp((0.0, 0.0, 0.055))
+    grasp = Grasp((0.0, 0.0, 0.055), kind="round")
 
     def _shape(self, body: mjcf.Element, label: Color = (0.80, 0.10, 0.10, 1), band: Color = WHITE) -> None:
         top = self.height
@@ -51,17 +51,17 @@ class Carton(Primitive):
     """An upright drinks carton with a gable."""
 
     HALF = 0.030
-    radius, height = 0.045, 0.135
-    grasp = Grasp((0.0, 0.0, 0.070))
+    radius, height = 0.045, 0.098
+    grasp = Grasp((0.0, 0.0, 0.062), kind="square")
     footprint = (HALF, HALF)
 
     def _shape(self, body: mjcf.Element, color: Color = WHITE, label: Color = (0.1, 0.35, 0.85, 1)) -> None:
-        half, shoulder = self.HALF, 0.110
-        self._box(body, (0, 0, shoulder / 2), (half, half, shoulder / 2), mass=0.22, rgba=color)
+        half, shoulder = self.HALF, 0.076
+        self._box(body, (0, 0, shoulder / 2), (half, half, shoulder / 2), mass=0.07, rgba=color)
         self._box(body, (0, 0, 0.5 * shoulder), (half + 0.0006, half + 0.0006, 0.2 * shoulder), **GHOST, rgba=label)
-        gable = {"rgba": label, "mass": 0.01}
-        self._box(body, (0, 0, shoulder + 0.006), (0.75 * half, half, 0.006), **gable)
-        self._box(body, (0, 0, shoulder + 0.018), (0.25 * half, half, 0.007), **gable)
+        gable = {"rgba": label, "mass": 0.002}  # narrower than the box: the fingers close on that
+        self._box(body, (0, 0, shoulder + 0.006), (0.75 * half, half - 0.004, 0.006), **gable)
+        self._box(body, (0, 0, shoulder + 0.017), (0.25 * half, half - 0.004, 0.005), **gable)
         self._mark(body, "center", (0, 0, 0))
 
 
@@ -81,8 +81,8 @@ class Bottle(Primitive):
     ) -> None:
         shoulder, neck, top = (0.135, 0.185, 0.200) if tall else (0.095, 0.125, 0.142)
         self.height = top
-        self.grasp = Grasp((0.0, 0.0, top - 0.024))  # by the neck: the palm has no room for it
-        self._disc(body, self.RADIUS, 0.0, shoulder, mass=0.24, rgba=glass)
+        self.grasp = Grasp((0.0, 0.0, top - 0.024), kind="round")  # by the neck: the palm has no room for it
+        self._disc(body, self.RADIUS, 0.0, shoulder, mass=0.10, rgba=glass)
         self._disc(body, self.RADIUS + 0.0006, 0.25 * shoulder, 0.75 * shoulder, **GHOST, rgba=label)
         self._disc(body, 0.62 * self.RADIUS, shoulder, 0.5 * (shoulder + neck), mass=0.01, rgba=glass)
         self._disc(body, 0.42 * self.RADIUS, 0.5 * (shoulder + neck), neck, mass=0.01, rgba=glass)
@@ -100,7 +100,7 @@ class Book(Primitive):
 
     def _shape(self, body: mjcf.Element, cover: Color = (0.10, 0.10, 0.13, 1)) -> None:
         x, y, z = self.WIDTH / 2, self.THICKNESS / 2, self.height / 2
-        self._box(body, (0, 0, z), (x, y, z), mass=0.25, rgba=cover)
+        self._box(body, (0, 0, z), (x, y, z), mass=0.10, rgba=cover)
         self._box(body, (0.0015, 0, z + 0.0006), (x, y - 0.004, z), **GHOST, rgba=(0.93, 0.9, 0.8, 1))
         self._box(body, (0, 0, 1.4 * z), (0.6 * x, y + 0.0006, 0.012), **GHOST, rgba=(0.85, 0.7, 0.2, 1))
         self._mark(body, "center", (0, 0, 0))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from worldenv_trl.scenes.entities.base import Primitive
-from worldenv_trl.scenes.entities.cookware import FryingPan, MokaPot, Stove
+from worldenv_trl.scenes.entities.cookware import FryingPan, MokaPot, WideStove
 from worldenv_trl.scenes.entities.groceries import Book, Bottle, Can, Carton, Packet
 from worldenv_trl.scenes.entities.storage import Basket, Cabinet, Caddy, DeepCabinet, Microwave, Rack, Shelf
 from worldenv_trl.scenes.entities.tableware import Bowl, Mug, Plate, Ramekin
@@ -41,6 +41,7 @@ CATEGORIES: Mapping[str, Category] = MappingProxyType(
         # tableware
         "bowl": _as(Bowl),
         "akita_black_bowl": _as(Bowl, scale=0.80, outside=(0.22, 0.22, 0.25, 1), inside=(0.52, 0.10, 0.08, 1)),
+        "green_bowl": _as(Bowl, scale=0.80),
         "white_bowl": _as(Bowl, outside=(0.92, 0.92, 0.93, 1), inside=(0.70, 0.72, 0.76, 1)),
         "red_bowl": _as(Bowl, outside=(0.78, 0.12, 0.10, 1), inside=(0.45, 0.06, 0.05, 1)),
         "plate": _as(Plate, scale=0.72),
@@ -72,7 +73,7 @@ CATEGORIES: Mapping[str, Category] = MappingProxyType(
         # cookware
         "chefmate_8_frypan": _as(FryingPan),
         "moka_pot": _as(MokaPot),
-        "flat_stove": _as(Stove),
+        "flat_stove": _as(WideStove),
         # storage
         "cabinet": _as(Cabinet),
         "wooden_cabinet": _as(DeepCabinet, yaw=math.pi),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 
 from dm_control import mjcf
 
@@ -18,10 +20,14 @@ class Cabinet(Primitive):
     """
 
     OPEN_BELOW = -0.14
-    HANDLE_HALF_WIDTH, HANDLE_REACH = 0.034, 0.060  # half the bar's length; how far it stands out from the front
+    HANDLE_HALF_WIDTH, HANDLE_RISE = 0.034, 0.007  # half the bar's length; its height over the drawer's middle
+    HANDLE_REACH: Mapping[str, float] = MappingProxyType(dict.fromkeys(("bottom", "middle", "top"), 0.060))
+    """How far each bar stands out from its front."""
     DEPTH, WIDTH, TOP = 0.10, 0.085, 0.168
     LEVELS: tuple[tuple[str, float], ...] = (("bottom", 0.03), ("middle", 0.085), ("top", 0.14))
     TRAVEL = (-0.16, 0.0)
+    BAR = 0.006  # half the bar's thickness
+    SIDE_TOP = 0.020  # upper edge of a drawer's sides, over its middle
     HOLLOW = False  # whether the drawers hold things; walls that collide cost time
     radius, height = 0.15, TOP + 0.004
     footprint = (WIDTH, DEPTH)
@@ -43,7 +49,7 @@ class Cabinet(Primitive):
             self._drawer(body, name, level, inside, front)
 
     def _drawer(self, body: mjcf.Element, name: str, level: float, inside: Color, front: Color) -> None:
-        back, inner = self.DEPTH, self.WIDTH - 0.010
+        back, inner, reach = self.DEPTH, self.WIDTH - 0.010, self.HANDLE_REACH[name]
         drawer = body.add("body", name=name, pos=(0, 0, level), gravcomp=1)
         drawer.add(
             "joint", name=name, type="slide", axis=(0, -1, 0), range=self.TRAVEL, limited=True, damping=8.0,
@@ -51,8 +57,10 @@ class Cabinet(Primitive):
         )  # fmt: skip
         box = {"rgba": inside} if self.HOLLOW else {"rgba": inside, "contype": 0, "conaffinity": 0}
         self._box(drawer, (0, 0, -0.018), (inner, back - 0.006, 0.003), mass=0.15, **box)
+        wall = (self.SIDE_TOP + 0.020) / 2
         for side in (-1, 1):
-            self._box(drawer, (side * (inner - 0.003), 0, 0), (0.003, back - 0.006, 0.020), mass=0.05, **box)
+            at = (side * (inner - 0.003), 0, self.SIDE_TOP - wall)
+            self._box(drawer, at, (0.003, back - 0.006, wall), mass=0.05, **box)
         if self.HOLLOW:
             self._box(drawer, (0, -back + 0.012, 0), (inner, 0.003, 0.020), mass=0.05, **box)
         self._box(drawer, (0, back, 0), (inner + 0.006, 0.004, 0.025), mass=0.1, rgba=front)
@@ -61,11 +69,12 @@ class Cabinet(Primitive):
             "friction": (1.5, 0.05, 0.001),
         }
         for side in (-1, 1):
-            post = (side * (self.HANDLE_HALF_WIDTH - 0.004), back + 0.5 * self.HANDLE_REACH, 0.007)
-            self._box(drawer, post, (0.004, 0.5 * self.HANDLE_REACH - 0.002, 0.005), mass=0.01, **metal)
-        bar = (0, back + self.HANDLE_REACH, 0.007)
-        self._box(drawer, bar, (self.HANDLE_HALF_WIDTH, 0.006, 0.007), mass=0.03, **metal)
+            post = (side * (self.HANDLE_HALF_WIDTH - 0.004), back + 0.5 * reach, self.HANDLE_RISE)
+            self._box(drawer, post, (0.004, 0.5 * reach - 0.002, 0.005), mass=0.01, **metal)
+        bar = (0, back + reach, self.HANDLE_RISE)
+        self._box(drawer, bar, (self.HANDLE_HALF_WIDTH, self.BAR, 0.007), mass=0.03, **metal)
         self._mark(drawer, f"{name}_handle", bar)
+        self._jut(drawer, f"{name}_front", (0, back + 0.5 * reach, 0), (self.WIDTH, 0.5 * reach + self.BAR, 0.025))
         self._region(drawer, f"{name}_region", (0, 0, 0.01), (inner - 0.008, back - 0.016, 0.028))
         self.states["Open", f"{name}_region"] = JointState(name, -math.inf, self.OPEN_BELOW, (-0.16, -0.14))
         closed = self.TRAVEL[1] - 0.005 if self.TRAVEL[1] <= 0 else 0.0
@@ -73,11 +82,17 @@ class Cabinet(Primitive):
 
 
 class DeepCabinet(Cabinet):
-    """A cabinet whose drawers hold a bowl; a drawer is closed past 0 (LIBERO), a centimetre before its stop."""
+    """A cabinet whose drawers hold a bowl; a drawer is closed past 0 (LIBERO), a centimetre before its stop.
 
-    TOP = 0.196
+    The lower a handle, the further it stands out, so that a hand that points down reaches every one of them.
+    """
+
+    TOP = 0.202
     LEVELS = (("bottom", 0.030), ("middle", 0.094), ("top", 0.158))
+    HANDLE_RISE, BAR = 0.015, 0.004
+    HANDLE_REACH = MappingProxyType({"bottom": 0.110, "middle": 0.085, "top": 0.036})
     TRAVEL = (-0.16, 0.01)
+    SIDE_TOP = 0.0  # fingers reach down on both sides of a bowl's rim
     HOLLOW = True
     height = TOP + 0.004
 
@@ -113,6 +128,7 @@ class Microwave(Primitive):
             self._box(door, (grip[0], -0.018, end * 0.045), (0.005, 0.014, 0.005), mass=0.01, **dark)
         self._box(door, grip, (0.006, 0.006, 0.052), mass=0.03, rgba=(0.80, 0.10, 0.12, 1))
         self._mark(door, "door_handle", grip)
+        self._jut(door, "door_leaf", (opening, -0.014, 0), (opening, 0.026, z))
         self._region(body, "heating_region", (-0.03, 0, z), (0.090, 0.095, 0.072))
         self._region(body, "top_side", (0, 0, 2 * z), (x, y, 0.002), on_top=True)
         self.states["Open", ""] = JointState("door", -math.inf, self.OPEN_BELOW, (-2.094, -1.3))

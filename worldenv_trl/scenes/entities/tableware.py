@@ -29,7 +29,7 @@ class Bowl(Primitive):
     ) -> None:
         foot, self.radius = scale * self.FOOT_RADIUS, scale * self.radius
         # Deep enough that the pads carry the bowl level.
-        self.grasp = Grasp((0.0, scale * self.RIM_RADIUS - 0.004, self.HEIGHT - 0.022))
+        self.grasp = Grasp((0.0, scale * self.RIM_RADIUS - 0.004, self.HEIGHT - 0.022), kind="rim")
         self._disc(body, foot, 0.0, 0.008, name="foot", mass=0.03, rgba=inside)
         self._ring(body, foot, scale * self.RIM_RADIUS, 0.0, self.HEIGHT, mass=0.006, rgba=outside)
         self._mark(body, "center", (0, 0, 0))
@@ -81,12 +81,12 @@ class Mug(Primitive):
         band: Color | None = None,
     ) -> None:
         radius, height = self.RADIUS, self.height
-        self._disc(body, radius - 0.003, 0.0, 0.008, mass=0.05, rgba=inside)
-        self._ring(body, radius - 0.003, radius - 0.003, 0.0, height, staves=10, mass=0.012, rgba=outside)
+        # Solid to whatever touches it: a ring of staves turns in the fingers.
+        self._disc(body, radius, 0.0, height, mass=0.10, rgba=(0, 0, 0, 0), group=3)
+        self._disc(body, radius - 0.003, 0.0, 0.4 * height, **GHOST, rgba=inside)
+        self._ring(body, radius - 0.003, radius - 0.003, 0.0, height, rgba=outside, **GHOST)
         if band is not None:
-            self._ring(
-                body, radius - 0.0022, radius - 0.0022, 0.0, 0.5 * height, staves=10, rgba=band, **GHOST
-            )  # fmt: skip
+            self._ring(body, radius - 0.0022, radius - 0.0022, 0.0, 0.5 * height, rgba=band, **GHOST)
         handle = {"rgba": outside if band is None else band, "mass": 0.005}
         for z in (0.022, 0.063):
             self._box(body, (radius + 0.010, 0, z), (0.012, 0.004, 0.004), **handle)

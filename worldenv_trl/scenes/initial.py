@@ -1,0 +1,117 @@
+"""Initial states of task files: drawn, left to come to rest, and kept as poses of what is not the robot.
+
+A pose is stored as float32; the state made from it has the arm at home and everything at rest, so a drawn state and one
+read from a file are the same, bit for bit.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from worldenv_trl.scenes import panda
+from worldenv_trl.scenes.simulation import SceneBatch, home_state
+from worldenv_trl.scenes.tasks import SPLITS
+
+if TYPE_CHECKING:
+    from worldenv_trl.scenes.files import FileTask
+
+__all__ = ["draw_poses", "load_poses", "save_poses", "states_from_poses"]
+
+_SETTLE_SUBSTEPS = 100
+_ATTEMPTS = 40
+_MOVED, _UPRIGHT = 0.04, 0.9  # metres; cosine of the tilt: a state that settles further away is drawn again
+
+
+def draw_poses(task: FileTask, split: str, start: int, count: int) -> np.ndarray:
+    """Poses ``[count, P]`` float32 of states from number ``start`` on: at rest, the goal not yet fulfilled.
+
+    Raises:
+        RuntimeError: if things cannot be placed clear of each other, or do not come to rest where they were placed.
+    """
+    model = task.build()
+    things = np.array([model.body(f"{name}/").id for name in task.problem.objects])
+    scene = SceneBatch(task, count, cameras=())
+    data = mujoco.MjData(model)
+    qpos, ctrl, targets = home_state(model, panda.HOME_Q)
+    bind = scene.batch.bind
+    waiting = np.arange(count, dtype=np.int32)
+    for attempt in range(_ATTEMPTS):
+        drawn = np.zeros((len(waiting), len(things), 3))
+        for row, index in enumerate(waiting):
+            # One generator per state and attempt: a larger count extends a smaller one.
+            rng = np.random.default_rng([task.seed, SPLITS.index(split), start + int(index), attempt])
+            data.qpos[:] = qpos
+            task.layout.draw(data, rng)
+            mujoco.mj_kinematics(model, data)
+            drawn[row] = data.xpos[things]
+            for name, value in (
+                ("qpos", data.qpos), ("qvel", 0.0), ("mocap_pos", data.mocap_pos), ("mocap_quat", data.mocap_quat),
+                ("ctrl", ctrl), ("userdata", targets), ("qacc_warmstart", 0.0),
+            ):  # fmt: skip
+                bind(name)[index] = value
+        scene.batch.step(waiting, nstep=_SETTLE_SUBSTEPS)
+        scene.batch.forward(waiting, stage=mujoco.mjtStage.mjSTAGE_POS.value)
+        moved = np.linalg.norm(scene.xpos[waiting][:, things] - drawn, axis=-1).max(-1, initial=0.0)
+        upright = scene.xmat[waiting][:, things].reshape(len(waiting), len(things), 9)[..., 8]
+        fine = (moved < _MOVED) & (upright.min(-1, initial=1.0) > _UPRIGHT) & ~scene.success()[waiting]
+        waiting = waiting[~fine]
+        if not len(waiting):
+            return np.concatenate([part.reshape(count, -1) for part in _parts(scene)], -1).astype(np.float32)
+    raise RuntimeError(
+        f"{task.name}: initial state {start + int(waiting[0])} does not come to rest in {_ATTEMPTS} tries: something "
+        "falls, is pushed away from its region in :init, or fulfils the goal at once"
+    )
+
+
+def states_from_poses(task: FileTask, poses: np.ndarray) -> np.ndarray:
+    """Integration states ``[n, S]`` float64 with things at ``poses [n, P]`` and the arm at home, all at rest."""
+    scene = SceneBatch(task, len(poses), cameras=())
+    bind = scene.batch.bind
+    qpos, ctrl, targets = home_state(task.build(), panda.HOME_Q)
+    bind("qpos")[:], bind("ctrl")[:], bind("userdata")[:] = qpos, ctrl, targets
+    free = _free(task.build())
+    mocap = bind("mocap_pos").shape[1]
+    joints, places, turns = np.split(poses.astype(np.float64), [len(free), len(free) + 3 * mocap], axis=-1)
+    bind("qpos")[:, free] = joints
+    bind("mocap_pos")[:] = places.reshape(len(poses), mocap, 3)
+    bind("mocap_quat")[:] = turns.reshape(len(poses), mocap, 4)
+    return scene.batch.state.copy()
+
+
+def load_poses(task: FileTask, path: Path) -> dict[str, np.ndarray]:
+    """The stored poses ``[n, P]`` of each split.
+
+    Raises:
+        RuntimeError: if the file belongs to another version of the task.
+    """
+    with np.load(path, allow_pickle=False) as stored:
+        poses = {split: stored[split] for split in SPLITS}
+        digest = int(stored["digest"])
+    width = len(_free(task.build())) + 7 * task.build().nmocap
+    if digest != task.digest or any(array.shape[1:] != (width,) for array in poses.values()):
+        raise RuntimeError(
+            f"{path.name} holds initial states of another version of {task.name}: make them again with "
+            "python recipes/init_states.py"
+        )
+    return poses
+
+
+def save_poses(task: FileTask, path: Path, count: int) -> None:
+    """Draws ``count`` states of each split and writes their poses."""
+    poses = {split: draw_poses(task, split, 0, count) for split in SPLITS}
+    np.savez_compressed(path, digest=np.int64(task.digest), **poses)
+
+
+def _free(model: mujoco.MjModel) -> np.ndarray:
+    """Addresses in ``qpos`` of everything but the robot."""
+    robot = {int(model.jnt_qposadr[j]) for j in range(model.njnt) if model.joint(j).name.startswith("panda/")}
+    return np.array([address for address in range(model.nq) if address not in robot])
+
+
+def _parts(scene: SceneBatch) -> tuple[np.ndarray, ...]:
+    free = _free(scene.model)
+    return scene.qpos[:, free], scene.batch.bind("mocap_pos"), scene.batch.bind("mocap_quat")
