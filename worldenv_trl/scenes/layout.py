@@ -17,6 +17,7 @@ from worldenv_trl.scenes.settings import part_of
 GAP = 0.002  # between footprints, m
 DROP = 0.001  # things start this much above what carries them
 MAX_TRIES = 500
+MIDDLE = 0.4  # share of the room inside a drawer or a basket that things start in: its walls are in the hand's way
 
 
 @dataclass
@@ -164,7 +165,7 @@ class Layout:
         site = self.model.site(f"{carrier}/{part}").id
         region = self.entities[carrier].regions[part]
         half = entity.footprint or (entity.radius, entity.radius)
-        slack = np.maximum(np.array(region.half_size[:2]) - max(half), 0.0)
+        slack = np.maximum(np.array(region.half_size[:2]) - max(half), 0.0) * (1.0 if region.on_top else MIDDLE)
         bottom = 0.0 if region.on_top else -region.half_size[2]
         local = np.array([*(rng.uniform(-slack, slack)), bottom])
         position = data.site_xpos[site] + data.site_xmat[site].reshape(3, 3) @ local

@@ -28,6 +28,7 @@ class Cabinet(Primitive):
     TRAVEL = (-0.16, 0.0)
     BAR = 0.006  # half the bar's thickness
     SIDE_TOP = 0.020  # upper edge of a drawer's sides, over its middle
+    REGION_AHEAD = 0.0  # of a drawer's middle, towards its front
     HOLLOW = False  # whether the drawers hold things; walls that collide cost time
     radius, height = 0.15, TOP + 0.004
     footprint = (WIDTH, DEPTH)
@@ -75,7 +76,8 @@ class Cabinet(Primitive):
         self._box(drawer, bar, (self.HANDLE_HALF_WIDTH, self.BAR, 0.007), mass=0.03, **metal)
         self._mark(drawer, f"{name}_handle", bar)
         self._jut(drawer, f"{name}_front", (0, back + 0.5 * reach, 0), (self.WIDTH, 0.5 * reach + self.BAR, 0.025))
-        self._region(drawer, f"{name}_region", (0, 0, 0.01), (inner - 0.008, back - 0.016, 0.028))
+        ahead = self.REGION_AHEAD
+        self._region(drawer, f"{name}_region", (0, ahead, 0.01), (inner - 0.008, back - 0.016 - ahead, 0.028))
         self.states["Open", f"{name}_region"] = JointState(name, -math.inf, self.OPEN_BELOW, (-0.16, -0.14))
         closed = self.TRAVEL[1] - 0.005 if self.TRAVEL[1] <= 0 else 0.0
         self.states["Close", f"{name}_region"] = JointState(name, closed, math.inf, (max(closed, 0.0), self.TRAVEL[1]))
@@ -92,6 +94,7 @@ class DeepCabinet(Cabinet):
     HANDLE_RISE, BAR = 0.015, 0.004
     HANDLE_REACH = MappingProxyType({"bottom": 0.110, "middle": 0.085, "top": 0.036})
     TRAVEL = (-0.16, 0.01)
+    REGION_AHEAD = 0.015  # an open drawer's middle is still half under the top
     SIDE_TOP = 0.0  # fingers reach down on both sides of a bowl's rim
     HOLLOW = True
     height = TOP + 0.004
