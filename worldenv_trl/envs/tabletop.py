@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +27,8 @@ from worldenv_trl.keys import (
     SUCCESS,
     TASK_ID,
 )
-from worldenv_trl.scenes import SceneBatch, Task, load_task
+from worldenv_trl.scenes import RendererPool, SceneBatch, Task, load_task
+from worldenv_trl.scenes.simulation import measured_states, step_together
 
 __all__ = ["TabletopEnv"]
 
@@ -144,10 +146,17 @@ class TabletopEnv(EnvBase):
             for item in tasks
         ]
         group = np.arange(num_envs) // group_repeats
+        threads = min(2 if num_threads is None else max(1, num_threads), num_envs)
+        self._executor = ThreadPoolExecutor(threads) if len(tasks) > 1 and threads > 1 else None
+        self._pool = RendererPool(threads) if cameras else None
         self._blocks: list[_Block] = []
         for slot, (item, choice) in enumerate(zip(tasks, starts, strict=True)):
             rows = np.flatnonzero(group % len(tasks) == slot)
-            scene = SceneBatch(item, len(rows), image_size=image_size, cameras=cameras, num_threads=num_threads)
+            # Many rows of a task are shared among the threads; tasks of few rows are dealt to them whole.
+            inside = threads if len(tasks) == 1 or len(rows) >= 2 * threads else 1
+            scene = SceneBatch(
+                item, len(rows), image_size=image_size, cameras=cameras, num_threads=inside, pool=self._pool
+            )
             groups = group[rows] // len(tasks)
             self._blocks.append(_Block(scene, choice, rows, groups, int(groups.max()) + 1))
         self._make_buffers(max_steps)
@@ -301,8 +310,10 @@ class TabletopEnv(EnvBase):
         active = np.ones(self.num_envs, bool) if active is None else active.reshape(-1).numpy()
         action = self._checked_action(tensordict, active)
         broken = np.zeros((self.num_envs, 1), bool)
-        for block in self._blocks:
-            local = block.scene.step(action[block.rows], active[block.rows])
+        shares = [action[block.rows] for block in self._blocks]
+        masks = [active[block.rows] for block in self._blocks]
+        failures = step_together([block.scene for block in self._blocks], shares, masks, self._executor)
+        for block, local in zip(self._blocks, failures, strict=True):
             broken[block.rows[local]] = True
             for row in block.rows[local]:
                 warnings.warn(
@@ -337,16 +348,24 @@ class TabletopEnv(EnvBase):
 
     def _read(self, active: np.ndarray) -> None:
         """Brings what ``active`` rows show up to date."""
-        for block in self._blocks:
-            local = np.flatnonzero(active[block.rows])
-            if not len(local):
-                continue
-            scene, rows = block.scene, block.rows[local]
-            for name, images in scene.render(local).items():
-                self._images[name][rows] = images
-            state = scene.measured_state() if self.proprio == "measured" else scene.commanded_state()
-            self._state[rows], self._kinematic[rows] = state[local], scene.kinematic_state()[local]
-            self._success[rows, 0] = scene.success()[local]
+        parts = [(block, np.flatnonzero(active[block.rows])) for block in self._blocks]
+        parts = [(block, local) for block, local in parts if len(local)]
+        scenes = [block.scene for block, _ in parts]
+        if not parts:
+            return
+        if self._pool is not None:
+            drawings, poses = [s.drawing for s in scenes], [block.scene.poses(local) for block, local in parts]
+            for (block, local), drawn in zip(parts, self._pool.render(drawings, poses), strict=True):
+                for buffer, images in zip(self._images.values(), drawn.values(), strict=True):
+                    buffer[block.rows[local]] = images
+        if self.proprio == "measured":
+            states = np.split(measured_states(scenes), np.cumsum([scene.num_envs for scene in scenes])[:-1])
+        else:
+            states = [scene.commanded_state() for scene in scenes]
+        for (block, local), state in zip(parts, states, strict=True):
+            rows = block.rows[local]
+            self._state[rows], self._kinematic[rows] = state[local], block.scene.kinematic_state()[local]
+            self._success[rows, 0] = block.scene.success()[local]
 
     def _observe(self) -> TensorDictBase:
         """A copy of what all rows show."""
@@ -373,6 +392,10 @@ class TabletopEnv(EnvBase):
         if not self.is_closed:
             for block in self._blocks:
                 block.scene.close()
+            if self._pool is not None:
+                self._pool.close()
+            if self._executor is not None:
+                self._executor.shutdown()
         super().close(raise_if_closed=raise_if_closed)
 
 
