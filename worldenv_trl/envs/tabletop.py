@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from tensordict import NonTensorData, NonTensorStack, TensorDict, TensorDictBase
-from torchrl.data import Binary, Bounded, Composite, NonTensor, Unbounded
 from torchrl.envs import EnvBase
 
 from worldenv_trl.envs.init_states import UNKNOWN_CONTEXT, InitStates
+from worldenv_trl.envs.tabletop_specs import tabletop_specs
 from worldenv_trl.keys import (
     ACTION,
     ACTION_DIM,
@@ -189,42 +189,10 @@ class TabletopEnv(EnvBase):
         self._text = NonTensorData(words[0], batch_size=[n]) if len(set(words)) == 1 else stack
 
     def _make_specs(self) -> None:
-        batch = self.batch_size
-
-        def real(width: int) -> Unbounded:
-            return Unbounded(shape=(*batch, width), device=self.device)
-
-        def integer() -> Unbounded:
-            return Unbounded(shape=(*batch, 1), dtype=torch.int64, device=self.device)
-
-        def flag() -> Binary:
-            return Binary(shape=(*batch, 1), dtype=torch.bool, device=self.device)
-
-        def nested(entries: dict) -> Composite:
-            return Composite(entries, shape=batch, device=self.device)
-
-        pixels = {
-            _IMAGE_NAMES[name]: Bounded(0, 255, shape=(*batch, *image.shape[1:]), dtype=torch.uint8, device=self.device)
-            for name, image in self._images.items()
-        }
-        observation = {
-            "observation": nested({**pixels, "state": real(STATE_DIM)}),
-            KINEMATIC_STATE: real(KINEMATIC_DIM),
-            INSTRUCTION: NonTensor(shape=batch, example_data=self.tasks[0].language, device=self.device),
-            TASK_ID: integer(),
-            CONTEXT_ID: integer(),
-            NUM_STEPS: integer(),
-            SUCCESS: flag(),
-        }
-        state = {CONTEXT_ID: integer(), NUM_STEPS: integer()}
-        if self.with_sim_state:
-            observation[SIM_STATE] = Unbounded(shape=(*batch, self._sim_size), dtype=torch.float64, device=self.device)
-            state[SIM_STATE] = observation[SIM_STATE].clone()
-        self.observation_spec = nested(observation)
-        self.state_spec = nested(state)
-        self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, ACTION_DIM), device=self.device)
-        self.reward_spec = real(1)
-        self.done_spec = nested({"done": flag(), "terminated": flag(), "truncated": flag()})
+        images = {_IMAGE_NAMES[name]: image.shape[1:] for name, image in self._images.items()}
+        width = self._sim_size if self.with_sim_state else None
+        specs = tabletop_specs(self.batch_size, images, self.tasks[0].language, width)
+        self.observation_spec, self.state_spec, self.action_spec, self.reward_spec, self.done_spec = specs
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = int(torch.randint(2**31, ()).item()) if seed is None else int(seed)
@@ -353,11 +321,20 @@ class TabletopEnv(EnvBase):
         scenes = [block.scene for block, _ in parts]
         if not parts:
             return
+        finish = None
         if self._pool is not None:
-            drawings, poses = [s.drawing for s in scenes], [block.scene.poses(local) for block, local in parts]
-            for (block, local), drawn in zip(parts, self._pool.render(drawings, poses), strict=True):
-                for buffer, images in zip(self._images.values(), drawn.values(), strict=True):
-                    buffer[block.rows[local]] = images
+            poses = [block.scene.poses(local) for block, local in parts]
+            finish = self._pool.start([scene.drawing for scene in scenes], poses)
+        try:
+            self._read_state(parts)  # while the images are drawn
+        finally:
+            drawn = [] if finish is None else finish()
+        for (block, local), images in zip(parts, drawn, strict=finish is not None):
+            for buffer, image in zip(self._images.values(), images.values(), strict=True):
+                buffer[block.rows[local]] = image
+
+    def _read_state(self, parts: list[tuple[_Block, np.ndarray]]) -> None:
+        scenes = [block.scene for block, _ in parts]
         if self.proprio == "measured":
             states = np.split(measured_states(scenes), np.cumsum([scene.num_envs for scene in scenes])[:-1])
         else:

@@ -82,6 +82,12 @@ class RendererPool:
 
     def render(self, drawings: Sequence[Drawing], rows: Sequence[Sequence[Row]]) -> list[dict[str, np.ndarray]]:
         """Draws several models at once: for each, and each camera, ``[len(rows), 3, H, W]`` uint8, upright."""
+        return self.start(drawings, rows)()
+
+    def start(
+        self, drawings: Sequence[Drawing], rows: Sequence[Sequence[Row]]
+    ) -> Callable[[], list[dict[str, np.ndarray]]]:
+        """Begins to ``render``; what it returns must be called, waits for the end and gives the images."""
         images, shared = [], []
         alone: dict[_Painter, list] = {painter: [] for painter in self._painters}
         for drawing, states in zip(drawings, rows, strict=True):
@@ -93,11 +99,15 @@ class RendererPool:
         busy = [painter for painter in self._painters if alone[painter] or shared]
         for painter in busy:
             painter.call(lambda p: p.draw(itertools.chain(alone[p], left)))
-        errors = [painter.wait() for painter in busy]
-        for error in errors:
-            if error is not None:
-                raise error
-        return images
+
+        def finish() -> list[dict[str, np.ndarray]]:
+            errors = [painter.wait() for painter in busy]
+            for error in errors:
+                if error is not None:
+                    raise error
+            return images
+
+        return finish
 
     def close(self) -> None:
         """Frees the GL contexts."""

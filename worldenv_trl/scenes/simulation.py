@@ -131,7 +131,9 @@ class SceneBatch:
 
     def render(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Images of ``rows``: for each camera ``[len(rows), 3, H, W]`` uint8, upright."""
-        return {} if self.drawing is None else self.drawing.render(self.poses(rows))
+        if self.drawing is None:
+            return {}
+        return dict(zip(self.cameras, self.drawing.render(self.poses(rows)).values(), strict=True))
 
     def poses(self, rows: np.ndarray | None = None) -> list[Row]:
         """Where everything is in ``rows``, for a renderer."""
