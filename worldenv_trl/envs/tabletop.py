@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from tensordict import NonTensorData, NonTensorStack, TensorDict, TensorDictBase
-from torchrl.data import Binary, Bounded, Composite, NonTensor, Unbounded
 from torchrl.envs import EnvBase
 
 from worldenv_trl.envs.init_states import UNKNOWN_CONTEXT, InitStates
+from worldenv_trl.envs.tabletop_specs import tabletop_specs
 from worldenv_trl.keys import (
     ACTION,
     ACTION_DIM,
@@ -26,7 +27,8 @@ from worldenv_trl.keys import (
     SUCCESS,
     TASK_ID,
 )
-from worldenv_trl.scenes import SceneBatch, Task, load_task
+from worldenv_trl.scenes import RendererPool, SceneBatch, Task, load_task
+from worldenv_trl.scenes.simulation import measured_states, step_together
 
 __all__ = ["TabletopEnv"]
 
@@ -144,10 +146,17 @@ class TabletopEnv(EnvBase):
             for item in tasks
         ]
         group = np.arange(num_envs) // group_repeats
+        threads = min(2 if num_threads is None else max(1, num_threads), num_envs)
+        self._executor = ThreadPoolExecutor(threads) if len(tasks) > 1 and threads > 1 else None
+        self._pool = RendererPool(threads) if cameras else None
         self._blocks: list[_Block] = []
         for slot, (item, choice) in enumerate(zip(tasks, starts, strict=True)):
             rows = np.flatnonzero(group % len(tasks) == slot)
-            scene = SceneBatch(item, len(rows), image_size=image_size, cameras=cameras, num_threads=num_threads)
+            # Many rows of a task are shared among the threads; tasks of few rows are dealt to them whole.
+            inside = threads if len(tasks) == 1 or len(rows) >= 2 * threads else 1
+            scene = SceneBatch(
+                item, len(rows), image_size=image_size, cameras=cameras, num_threads=inside, pool=self._pool
+            )
             groups = group[rows] // len(tasks)
             self._blocks.append(_Block(scene, choice, rows, groups, int(groups.max()) + 1))
         self._make_buffers(max_steps)
@@ -180,42 +189,10 @@ class TabletopEnv(EnvBase):
         self._text = NonTensorData(words[0], batch_size=[n]) if len(set(words)) == 1 else stack
 
     def _make_specs(self) -> None:
-        batch = self.batch_size
-
-        def real(width: int) -> Unbounded:
-            return Unbounded(shape=(*batch, width), device=self.device)
-
-        def integer() -> Unbounded:
-            return Unbounded(shape=(*batch, 1), dtype=torch.int64, device=self.device)
-
-        def flag() -> Binary:
-            return Binary(shape=(*batch, 1), dtype=torch.bool, device=self.device)
-
-        def nested(entries: dict) -> Composite:
-            return Composite(entries, shape=batch, device=self.device)
-
-        pixels = {
-            _IMAGE_NAMES[name]: Bounded(0, 255, shape=(*batch, *image.shape[1:]), dtype=torch.uint8, device=self.device)
-            for name, image in self._images.items()
-        }
-        observation = {
-            "observation": nested({**pixels, "state": real(STATE_DIM)}),
-            KINEMATIC_STATE: real(KINEMATIC_DIM),
-            INSTRUCTION: NonTensor(shape=batch, example_data=self.tasks[0].language, device=self.device),
-            TASK_ID: integer(),
-            CONTEXT_ID: integer(),
-            NUM_STEPS: integer(),
-            SUCCESS: flag(),
-        }
-        state = {CONTEXT_ID: integer(), NUM_STEPS: integer()}
-        if self.with_sim_state:
-            observation[SIM_STATE] = Unbounded(shape=(*batch, self._sim_size), dtype=torch.float64, device=self.device)
-            state[SIM_STATE] = observation[SIM_STATE].clone()
-        self.observation_spec = nested(observation)
-        self.state_spec = nested(state)
-        self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, ACTION_DIM), device=self.device)
-        self.reward_spec = real(1)
-        self.done_spec = nested({"done": flag(), "terminated": flag(), "truncated": flag()})
+        images = {_IMAGE_NAMES[name]: image.shape[1:] for name, image in self._images.items()}
+        width = self._sim_size if self.with_sim_state else None
+        specs = tabletop_specs(self.batch_size, images, self.tasks[0].language, width)
+        self.observation_spec, self.state_spec, self.action_spec, self.reward_spec, self.done_spec = specs
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = int(torch.randint(2**31, ()).item()) if seed is None else int(seed)
@@ -301,8 +278,10 @@ class TabletopEnv(EnvBase):
         active = np.ones(self.num_envs, bool) if active is None else active.reshape(-1).numpy()
         action = self._checked_action(tensordict, active)
         broken = np.zeros((self.num_envs, 1), bool)
-        for block in self._blocks:
-            local = block.scene.step(action[block.rows], active[block.rows])
+        shares = [action[block.rows] for block in self._blocks]
+        masks = [active[block.rows] for block in self._blocks]
+        failures = step_together([block.scene for block in self._blocks], shares, masks, self._executor)
+        for block, local in zip(self._blocks, failures, strict=True):
             broken[block.rows[local]] = True
             for row in block.rows[local]:
                 warnings.warn(
@@ -337,16 +316,33 @@ class TabletopEnv(EnvBase):
 
     def _read(self, active: np.ndarray) -> None:
         """Brings what ``active`` rows show up to date."""
-        for block in self._blocks:
-            local = np.flatnonzero(active[block.rows])
-            if not len(local):
-                continue
-            scene, rows = block.scene, block.rows[local]
-            for name, images in scene.render(local).items():
-                self._images[name][rows] = images
-            state = scene.measured_state() if self.proprio == "measured" else scene.commanded_state()
-            self._state[rows], self._kinematic[rows] = state[local], scene.kinematic_state()[local]
-            self._success[rows, 0] = scene.success()[local]
+        parts = [(block, np.flatnonzero(active[block.rows])) for block in self._blocks]
+        parts = [(block, local) for block, local in parts if len(local)]
+        scenes = [block.scene for block, _ in parts]
+        if not parts:
+            return
+        finish = None
+        if self._pool is not None:
+            poses = [block.scene.poses(local) for block, local in parts]
+            finish = self._pool.start([scene.drawing for scene in scenes], poses)
+        try:
+            self._read_state(parts)  # while the images are drawn
+        finally:
+            drawn = [] if finish is None else finish()
+        for (block, local), images in zip(parts, drawn, strict=finish is not None):
+            for buffer, image in zip(self._images.values(), images.values(), strict=True):
+                buffer[block.rows[local]] = image
+
+    def _read_state(self, parts: list[tuple[_Block, np.ndarray]]) -> None:
+        scenes = [block.scene for block, _ in parts]
+        if self.proprio == "measured":
+            states = np.split(measured_states(scenes), np.cumsum([scene.num_envs for scene in scenes])[:-1])
+        else:
+            states = [scene.commanded_state() for scene in scenes]
+        for (block, local), state in zip(parts, states, strict=True):
+            rows = block.rows[local]
+            self._state[rows], self._kinematic[rows] = state[local], block.scene.kinematic_state()[local]
+            self._success[rows, 0] = block.scene.success()[local]
 
     def _observe(self) -> TensorDictBase:
         """A copy of what all rows show."""
@@ -373,6 +369,10 @@ class TabletopEnv(EnvBase):
         if not self.is_closed:
             for block in self._blocks:
                 block.scene.close()
+            if self._pool is not None:
+                self._pool.close()
+            if self._executor is not None:
+                self._executor.shutdown()
         super().close(raise_if_closed=raise_if_closed)
 
 

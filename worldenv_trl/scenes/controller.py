@@ -26,6 +26,7 @@ def _rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
 
 
 _FRAMES = [(np.array(joint.xyz, float), _rotation(*joint.rpy)) for joint in panda.JOINTS]
+_TURN = np.array([1.0, -1.0])  # x turns towards y, y away from x
 _TCP = (np.array([0.0, 0.0, panda.TCP_OFFSET]), _rotation(0.0, 0.0, panda.HAND_YAW))
 
 
@@ -41,24 +42,23 @@ def forward_kinematics(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     n = len(q)
     position = np.broadcast_to(np.array(panda.BASE_POSITION, float), (n, 3))
     rotation = np.broadcast_to(np.eye(3), (n, 3, 3))
-    origins, axes = [], []
+    cosine, sine = np.cos(q)[:, :, None, None], np.sin(q)[:, :, None, None] * _TURN
+    origins, axis = np.empty((n, len(_FRAMES), 3)), np.empty((n, len(_FRAMES), 3))
     for index, (offset, fixed) in enumerate(_FRAMES):
-        position = position + rotation @ offset
+        if offset.any():
+            position = position + rotation @ offset
         rotation = rotation @ fixed
-        c, s = np.cos(q[:, index]), np.sin(q[:, index])
-        turned = np.empty_like(rotation)
-        turned[..., 0] = rotation[..., 0] * c[:, None] + rotation[..., 1] * s[:, None]
-        turned[..., 1] = rotation[..., 1] * c[:, None] - rotation[..., 0] * s[:, None]
-        turned[..., 2] = rotation[..., 2]
-        rotation = turned
-        origins.append(position)
-        axes.append(rotation[..., 2])
+        x_and_y = rotation[..., :2] * cosine[:, index] + rotation[..., 1::-1] * sine[:, index]
+        rotation[..., :2] = x_and_y
+        origins[:, index], axis[:, index] = position, rotation[..., 2]
     position = position + rotation @ _TCP[0]
     rotation = rotation @ _TCP[1]
-    axis = np.stack(axes, 1)  # [n, 7, 3]
-    lever = position[:, None] - np.stack(origins, 1)
-    jacobian = np.concatenate([np.cross(axis, lever), axis], -1).swapaxes(1, 2)
-    return position, rotation, jacobian
+    lever = position[:, None] - origins
+    columns = np.empty((n, len(_FRAMES), 6))  # in this layout products keep their last bits, and runs replay
+    for index, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        columns[..., index] = axis[..., i] * lever[..., j] - axis[..., j] * lever[..., i]
+    columns[..., 3:] = axis
+    return position, rotation, columns.swapaxes(1, 2)
 
 
 def rotation_from_vector(vector: np.ndarray) -> np.ndarray:

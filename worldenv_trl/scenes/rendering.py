@@ -1,18 +1,18 @@
-"""Rendering many rows of one model on a few threads, one GL context each."""
+"""Rendering many rows of one or several models on a few threads, one GL context each."""
 
 from __future__ import annotations
 
 import atexit
-import copy
 import importlib
+import itertools
 import os
 import queue
 import threading
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image
 
 _BACKEND = os.environ.get("MUJOCO_GL", "the default")
 _REMEDY = (
@@ -33,133 +33,158 @@ except ModuleNotFoundError:
 except (ImportError, AttributeError, RuntimeError) as error:
     raise ImportError(f"GL cannot be loaded with MUJOCO_GL={_BACKEND!r} ({error}): {_REMEDY}") from error
 
-# Twice the pixels each way and a mean: in software GL cheaper than MuJoCo's four samples a pixel, and unlike those not
-# done under a lock that all contexts share, so that two threads draw nearly twice as fast as one.
-SUPERSAMPLING = 2
+from worldenv_trl.scenes.canvas import Canvas, Paint  # noqa: E402 - imports MuJoCo, which must have found its GL
 
-Paint = Callable[[mujoco.MjModel, np.ndarray], None]
+Row = tuple[np.ndarray, np.ndarray, np.ndarray]  # qpos [nq], mocap_pos [nmocap, 3], mocap_quat [nmocap, 4]
 
 
 class RendererPool:
-    """Draws rows of a batch as images.
-
-    Args:
-        model: the compiled model; each thread draws its own copy.
-        cameras: names of the cameras.
-        image_size: height and width (px).
-        num_threads: threads, each with one GL context.
-        paint: called with a thread's model copy and a row's ``qpos`` before it is drawn, to set colours that depend on
-            the state (a burner that glows).
+    """Threads with a GL context each, which draw rows of every model that was added.
 
     Raises:
         RuntimeError: if no GL context can be made; the message says what to install.
     """
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        cameras: Sequence[str],
-        image_size: int,
-        num_threads: int,
-        paint: Paint | None = None,
-    ) -> None:
-        self.cameras, self.image_size = tuple(cameras), image_size
+    def __init__(self, num_threads: int) -> None:
         self._painters: list[_Painter] = []
-        errors: list[Exception] = []
-        for _ in range(max(1, num_threads)):
-            painter = _Painter(model, image_size, paint)
-            self._painters.append(painter)
-            # One after another: GL loaders are not safe to run side by side.
-            if (error := painter.wait()) is not None:
-                errors.append(error)
-                break
         # A GL context is freed on the thread that made it. At exit this must come before MuJoCo ends EGL, whose own
         # exit handler was registered when the first context was made: later ones run earlier.
         self._close = weakref.finalize(self, _stop, self._painters)
         self._close.atexit = False
+        for _ in range(max(1, num_threads)):
+            self._painters.append(_Painter())
+            # One after another: GL loaders are not safe to run side by side.
+            self._check(self._painters[-1].wait())
         atexit.register(self._close)
-        if errors:
-            self._close()
-            raise RuntimeError(
-                f"no image can be rendered with MUJOCO_GL={_BACKEND!r} ({errors[0]}): {_REMEDY}"
-            ) from errors[0]
+        self._num_models = 0
 
-    def render(self, qpos: np.ndarray, mocap_pos: np.ndarray, mocap_quat: np.ndarray) -> dict[str, np.ndarray]:
-        """Draws rows ``qpos [n, nq]``, ``mocap_pos [n, nmocap, 3]``, ``mocap_quat [n, nmocap, 4]``: for each camera
-        ``[n, 3, H, W]`` uint8, upright."""
-        size = self.image_size
-        images = {name: np.empty((len(qpos), 3, size, size), np.uint8) for name in self.cameras}
-        busy = self._painters[: len(qpos)]
-        for start, painter in enumerate(busy):
-            painter.draw(qpos, mocap_pos, mocap_quat, range(start, len(qpos), len(busy)), images)
+    def add(
+        self,
+        model: mujoco.MjModel,
+        cameras: Sequence[str],
+        image_size: int,
+        num_rows: int,
+        paint: Paint | None = None,
+    ) -> Drawing:
+        """What draws rows of ``model``, of which there are ``num_rows`` at most; see :class:`Canvas` for the rest.
+
+        Few rows are left to one thread: each thread that takes part costs memory and time to set up.
+        """
+        threads = len(self._painters)
+        first = self._num_models % threads
+        painters = self._painters if num_rows >= 2 * threads else self._painters[first : first + 1]
+        self._num_models += 1
+        key = object()
+        for painter in painters:
+            painter.call(lambda p: p.canvases.__setitem__(key, Canvas(model, cameras, image_size, paint)))
+            self._check(painter.wait())
+        return Drawing(self, key, painters, tuple(cameras), image_size)
+
+    def render(self, drawings: Sequence[Drawing], rows: Sequence[Sequence[Row]]) -> list[dict[str, np.ndarray]]:
+        """Draws several models at once: for each, and each camera, ``[len(rows), 3, H, W]`` uint8, upright."""
+        return self.start(drawings, rows)()
+
+    def start(
+        self, drawings: Sequence[Drawing], rows: Sequence[Sequence[Row]]
+    ) -> Callable[[], list[dict[str, np.ndarray]]]:
+        """Begins to ``render``; what it returns must be called, waits for the end and gives the images."""
+        images, shared = [], []
+        alone: dict[_Painter, list] = {painter: [] for painter in self._painters}
+        for drawing, states in zip(drawings, rows, strict=True):
+            shape = (len(states), 3, drawing.image_size, drawing.image_size)
+            images.append({name: np.empty(shape, np.uint8) for name in drawing.cameras})
+            jobs = shared if len(drawing.painters) > 1 else alone[drawing.painters[0]]
+            jobs += [(drawing.key, state, [v[row] for v in images[-1].values()]) for row, state in enumerate(states)]
+        left = iter(shared)  # threads take the next row as they get there: rows do not cost the same
+        busy = [painter for painter in self._painters if alone[painter] or shared]
         for painter in busy:
-            error = painter.wait()
-            if error is not None:
-                raise error
-        return images
+            painter.call(lambda p: p.draw(itertools.chain(alone[p], left)))
+
+        def finish() -> list[dict[str, np.ndarray]]:
+            errors = [painter.wait() for painter in busy]
+            for error in errors:
+                if error is not None:
+                    raise error
+            return images
+
+        return finish
 
     def close(self) -> None:
         """Frees the GL contexts."""
         self._close()
+        atexit.unregister(self._close)
+
+    def _check(self, error: Exception | None) -> None:
+        if error is not None:
+            self._close()
+            raise RuntimeError(f"no image can be rendered with MUJOCO_GL={_BACKEND!r} ({error}): {_REMEDY}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """A model in a pool, with its cameras."""
+
+    pool: RendererPool
+    key: object
+    painters: Sequence[_Painter]
+    cameras: tuple[str, ...]
+    image_size: int
+
+    def render(self, rows: Sequence[Row]) -> dict[str, np.ndarray]:
+        """For each camera ``[len(rows), 3, H, W]`` uint8, upright."""
+        return self.pool.render([self], [rows])[0]
 
 
 class _Painter:
-    """One thread with one GL context."""
+    """One thread with one GL context, and a canvas for each model on it."""
 
-    def __init__(self, model: mujoco.MjModel, image_size: int, paint: Paint | None) -> None:
+    def __init__(self) -> None:
+        self.canvases: dict[object, Canvas] = {}
         self._jobs: queue.SimpleQueue = queue.SimpleQueue()
         self._results: queue.SimpleQueue = queue.SimpleQueue()
-        self.thread = threading.Thread(target=self._run, args=(copy.copy(model), image_size, paint), daemon=True)
+        self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
 
-    def draw(self, *job: object) -> None:
+    def call(self, job: Callable[[_Painter], object] | None) -> None:
+        """Has the thread do ``job``, or end; ``wait`` for its error, or None."""
         self._jobs.put(job)
-
-    def stop(self) -> None:
-        self._jobs.put(None)
 
     def wait(self) -> Exception | None:
         return self._results.get()
 
-    def _run(self, model: mujoco.MjModel, image_size: int, paint: Paint | None) -> None:
-        fine = SUPERSAMPLING * image_size
-        model.vis.quality.offsamples = 0
-        model.vis.global_.offwidth = model.vis.global_.offheight = fine
+    def draw(self, jobs: Iterator[tuple[object, Row, list[np.ndarray]]]) -> None:
+        last = None
+        for key, row, images in jobs:
+            canvas = self.canvases[key]
+            if canvas is not last:
+                canvas.make_current()
+                last = canvas
+            canvas.draw(*row, images)
+
+    def _run(self) -> None:
+        context = None
         try:
-            renderer = mujoco.Renderer(model, fine, fine)
+            context = gl_context.GLContext(64, 64)  # the size is of no use: MuJoCo draws into buffers of its own
+            context.make_current()
+            self._results.put(None)
         except Exception as error:
             self._results.put(error)
-            return
-        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
-        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        data, frame = mujoco.MjData(model), np.empty((fine, fine, 3), np.uint8)
-        self._results.put(None)
         while (job := self._jobs.get()) is not None:
-            qpos, mocap_pos, mocap_quat, rows, images = job
             try:
-                for row in rows:
-                    data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = qpos[row], mocap_pos[row], mocap_quat[row]
-                    mujoco.mj_kinematics(model, data)
-                    mujoco.mj_camlight(model, data)
-                    if paint is not None:
-                        paint(model, qpos[row])
-                    for name, batch in images.items():
-                        renderer.update_scene(data, name)
-                        batch[row] = _shrunk(renderer.render(out=frame)).transpose(2, 0, 1)
+                job(self)
                 self._results.put(None)
             except Exception as error:
                 self._results.put(error)
-        renderer.close()
-
-
-def _shrunk(frame: np.ndarray) -> np.ndarray:
-    """Means of the ``SUPERSAMPLING x SUPERSAMPLING`` blocks of ``[H, W, 3]`` uint8, rounded."""
-    image = Image.frombuffer("RGB", frame.shape[1::-1], frame, "raw", "RGB", 0, 1)
-    return np.asarray(image.reduce(SUPERSAMPLING))
+        for canvas in self.canvases.values():
+            canvas.close()
+        self.canvases.clear()
+        if context is not None:
+            context.free()
 
 
 def _stop(painters: list[_Painter]) -> None:
     for painter in painters:
-        painter.stop()
+        painter.call(None)
     for painter in painters:
         painter.thread.join()
+    painters.clear()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -10,7 +11,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from worldenv_trl.scenes import controller, panda
-from worldenv_trl.scenes.rendering import RendererPool
+from worldenv_trl.scenes.rendering import RendererPool, Row
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.tasks import Task
@@ -32,6 +33,7 @@ class SceneBatch:
         image_size: height and width (px), at least 16.
         cameras: cameras to render (``agentview``, ``wrist``), or none.
         num_threads: threads for physics and rendering; default: one per core, two at most.
+        pool: draws the images, instead of threads of the batch's own; the batch does not close it.
 
     Raises:
         ValueError: for an impossible size or an unknown camera.
@@ -46,6 +48,7 @@ class SceneBatch:
         image_size: int = 64,
         cameras: Sequence[str] = ("agentview",),
         num_threads: int | None = None,
+        pool: RendererPool | None = None,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
@@ -70,10 +73,11 @@ class SceneBatch:
         self._mocap_pos, self._mocap_quat = self.batch.bind("mocap_pos"), self.batch.bind("mocap_quat")
         self.xpos, self.xmat = self.batch.bind("xpos"), self.batch.bind("xmat")
         self.site_xpos, self.site_xmat = self.batch.bind("site_xpos"), self.batch.bind("site_xmat")
-        self.cameras, self.renderers = tuple(cameras), None
+        self.cameras, self.drawing = tuple(cameras), None
         if cameras:
+            self._own_pool = RendererPool(min(threads, num_envs)) if pool is None else None
             names = [known[name] for name in cameras]
-            self.renderers = RendererPool(self.model, names, image_size, min(threads, num_envs), task.paint)
+            self.drawing = (pool or self._own_pool).add(self.model, names, image_size, num_envs, task.paint)
 
     def reset(self, rows: np.ndarray, sim_state: np.ndarray) -> None:
         """Puts ``rows [k]`` into integration states ``sim_state [k, S]``, exactly.
@@ -98,41 +102,47 @@ class SceneBatch:
 
         Returns the rows ``[k]`` whose physics blew up; they are left in the state before this step.
         """
-        rows = np.arange(self.num_envs) if active is None else np.flatnonzero(active)
-        if not len(rows):
-            return rows
-        before = self.batch.state[rows]
-        self._targets[rows] = controller.advance_targets(self._targets[rows], action[rows])
-        self._ctrl[np.ix_(rows, self._actuators[:7])] = controller.joint_targets(
-            self.qpos[np.ix_(rows, self._arm)], self._targets[rows]
-        )
-        self._ctrl[rows, self._actuators[7]] = panda.FINGER_TRAVEL * self._targets[rows, 12]
-        rows = rows.astype(np.int32)
-        self.batch.step(rows, nstep=panda.SUBSTEPS)
-        with np.errstate(invalid="ignore"):
-            sane = (np.abs(self.qvel[rows]) < _MAX_SPEED).all(-1) & np.isfinite(self.qpos[rows]).all(-1)
-        if not sane.all():
-            self.batch.state[rows[~sane]] = before[~sane]
-        self._make_current(rows)
-        return rows[~sane]
+        return step_together([self], [action], [active])[0]
 
     def _make_current(self, rows: np.ndarray) -> None:
         # Derived poses only: they do not touch the integration state, so a reset to it continues identically.
         self.batch.forward(rows, stage=_POSITIONS)
 
+    def _aim(self, rows: np.ndarray, targets: np.ndarray, joints: np.ndarray) -> np.ndarray:
+        """Sets the controller's targets and what it asks of the motors; returns the state before, ``[k, S]``."""
+        before = self.batch.state[rows]
+        self._targets[rows] = targets
+        self._ctrl[rows[:, None], self._actuators[:7]] = joints
+        self._ctrl[rows, self._actuators[7]] = panda.FINGER_TRAVEL * targets[:, 12]
+        return before
+
+    def _advance(self, rows: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """One control step of physics; returns the rows that blew up, put back to where they were."""
+        self.batch.step(rows, nstep=panda.SUBSTEPS, stage=_POSITIONS)
+        # One number a row, wrong wherever something is; almost always nothing is.
+        if np.abs(self.qvel).max(initial=0.0) < _MAX_SPEED and np.isfinite(self.qpos).all():
+            return rows[:0]
+        with np.errstate(invalid="ignore"):
+            sane = (np.abs(self.qvel[rows]) < _MAX_SPEED).all(-1) & np.isfinite(self.qpos[rows]).all(-1)
+        if not sane.all():
+            self.batch.state[rows[~sane]] = before[~sane]
+            self._make_current(rows[~sane])
+        return rows[~sane]
+
     def render(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Images of ``rows``: for each camera ``[len(rows), 3, H, W]`` uint8, upright."""
-        if self.renderers is None:
+        if self.drawing is None:
             return {}
-        rows = slice(None) if rows is None else rows
-        images = self.renderers.render(self.qpos[rows], self._mocap_pos[rows], self._mocap_quat[rows])
-        return dict(zip(self.cameras, images.values(), strict=True))
+        return dict(zip(self.cameras, self.drawing.render(self.poses(rows)).values(), strict=True))
+
+    def poses(self, rows: np.ndarray | None = None) -> list[Row]:
+        """Where everything is in ``rows``, for a renderer."""
+        rows = range(self.num_envs) if rows is None else rows
+        return [(self.qpos[row], self._mocap_pos[row], self._mocap_quat[row]) for row in rows]
 
     def measured_state(self) -> np.ndarray:
         """Hand position (m), axis-angle (rad) and gripper opening as they are, ``[n, 7]`` float32."""
-        rotation = controller.hand_axis_angle(self.site_xmat[:, self._tcp].reshape(-1, 3, 3))
-        opening = self.qpos[:, self._finger, None] / panda.FINGER_TRAVEL
-        return np.concatenate([self.site_xpos[:, self._tcp], rotation, np.clip(opening, 0, 1)], -1).astype(np.float32)
+        return measured_states([self])
 
     def commanded_state(self) -> np.ndarray:
         """Target position (m), axis-angle (rad) and gripper opening, ``[n, 7]`` float32."""
@@ -160,9 +170,51 @@ class SceneBatch:
         return self.batch.state.copy()
 
     def close(self) -> None:
-        if self.renderers is not None:
-            self.renderers.close()
-            self.renderers = None
+        if self.drawing is not None and self._own_pool is not None:
+            self._own_pool.close()
+        self.drawing = None
+
+
+def step_together(
+    scenes: Sequence[SceneBatch],
+    actions: Sequence[np.ndarray],
+    active: Sequence[np.ndarray | None],
+    executor: Executor | None = None,
+) -> list[np.ndarray]:
+    """``SceneBatch.step`` for several batches; those with one thread step side by side on ``executor``."""
+    every = [
+        np.arange(scene.num_envs, dtype=np.int32) if mask is None else np.flatnonzero(mask).astype(np.int32)
+        for scene, mask in zip(scenes, active, strict=True)
+    ]
+    moved = np.concatenate([action[rows] for action, rows in zip(actions, every, strict=True)])
+    if not len(moved):
+        return every
+    targets = np.concatenate([scene._targets[rows] for scene, rows in zip(scenes, every, strict=True)])
+    angles = np.concatenate([scene.qpos[rows[:, None], scene._arm] for scene, rows in zip(scenes, every, strict=True)])
+    targets = controller.advance_targets(targets, moved)
+    joints = controller.joint_targets(angles, targets)
+    broken, waiting, start = list(every), [], 0
+    for index, (scene, rows) in enumerate(zip(scenes, every, strict=True)):
+        if not len(rows):
+            continue
+        share = slice(start, start := start + len(rows))
+        before = scene._aim(rows, targets[share], joints[share])
+        if executor is not None and scene.batch.nthread == 1:
+            waiting.append((index, executor.submit(scene._advance, rows, before)))
+        else:
+            broken[index] = scene._advance(rows, before)
+    for index, result in waiting:
+        broken[index] = result.result()
+    return broken
+
+
+def measured_states(scenes: Sequence[SceneBatch]) -> np.ndarray:
+    """``SceneBatch.measured_state`` of several batches, one after the other."""
+    position = np.concatenate([scene.site_xpos[:, scene._tcp] for scene in scenes])
+    matrix = np.concatenate([scene.site_xmat[:, scene._tcp].reshape(-1, 3, 3) for scene in scenes])
+    opening = np.concatenate([scene.qpos[:, scene._finger, None] for scene in scenes]) / panda.FINGER_TRAVEL
+    rotation = controller.hand_axis_angle(matrix)
+    return np.concatenate([position, rotation, np.clip(opening, 0, 1)], -1).astype(np.float32)
 
 
 def _short_name(camera: str) -> str:
