@@ -18,6 +18,7 @@ from worldenv_trl.keys import (
     INSTRUCTION,
     KINEMATIC_STATE,
     KINEMATIC_STATES,
+    NOISE_SEED,
     NUM_STEPS,
     STATE,
     STATES,

@@ -14,7 +14,7 @@ from tensordict import NonTensorData, TensorDict
 
 from worldenv_trl import keys
 from worldenv_trl.record import RolloutWriter, read_attachments, read_metadata, read_rollouts
-from worldenv_trl.record import writer as writer_module
+from worldenv_trl.record import mcap_file as writer_module
 
 
 def make_rollouts(rows: int = 4, steps: int = 10, size: int = 32) -> TensorDict:

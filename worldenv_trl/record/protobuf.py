@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-__all__ = ["FixedMessage", "MessageField", "image_data"]
+__all__ = ["FixedMessage", "MessageField", "image_data", "varint"]
 
 _DOUBLE, _FLOAT, _BOOL, _STRING, _MESSAGE, _BYTES, _SFIXED32, _SFIXED64 = 1, 2, 8, 9, 11, 12, 15, 16
 _TYPES = {
@@ -143,11 +143,12 @@ def _kind(field: MessageField) -> tuple[int, bool]:
 def _header(number: int, field: MessageField) -> bytes:
     kind, repeated = _kind(field)
     if repeated or kind == _BYTES:
-        return _varint(number << 3 | _LENGTH_DELIMITED) + _varint(field.nbytes)
-    return _varint(number << 3 | _WIRE[kind])
+        return varint(number << 3 | _LENGTH_DELIMITED) + varint(field.nbytes)
+    return varint(number << 3 | _WIRE[kind])
 
 
-def _varint(value: int) -> bytes:
+def varint(value: int) -> bytes:
+    """A protobuf varint."""
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -168,8 +169,8 @@ def _read_varint(message: bytes, position: int) -> tuple[int, int]:
 
 
 def _bytes_field(number: int, value: bytes) -> bytes:
-    return _varint(number << 3 | _LENGTH_DELIMITED) + _varint(len(value)) + value
+    return varint(number << 3 | _LENGTH_DELIMITED) + varint(len(value)) + value
 
 
 def _varint_field(number: int, value: int) -> bytes:
-    return _varint(number << 3) + _varint(value)
+    return varint(number << 3) + varint(value)
