@@ -352,7 +352,7 @@ def test_physics_and_imagination_have_the_same_interface():
     physics, imagination = leaves(real.observation_spec), leaves(env.observation_spec)
     shared = set(physics) - {SUCCESS}
     assert {key: imagination[key] for key in shared} == {key: physics[key] for key in shared}
-    assert set(imagination) - set(physics) == {FRAMES, STATES, KINEMATIC_STATES}
+    assert set(imagination) - set(physics) == {FRAMES, STATES, KINEMATIC_STATES, NOISE_SEED}
     assert env.action_keys == real.action_keys == [CHUNK]  # MultiAction leaves its spec's chunk length open (-1)
     assert env.full_action_spec[CHUNK].shape[-1] == real.full_action_spec[CHUNK].shape[-1] == 7
     assert leaves(env.full_done_spec) == leaves(real.full_done_spec)

@@ -63,8 +63,7 @@ class Annotator:
             values = [flat[e.key if e.stored == "root" else ("next", *e.key)][row, :length] for e in layout.numbers]
             index = np.stack([np.full(length, number, np.int64), np.arange(length, dtype=np.int64)])[..., None]
             packed = message.pack([*index.view(np.uint8), *map(to_bytes, values)])
-            for step, data in enumerate(packed):
-                self._file.add(channel, self._time(number, step), data, number)
+            self._file.add((channel, self._time(number, step), data, number) for step, data in enumerate(packed))
         self._file.flush()
 
 

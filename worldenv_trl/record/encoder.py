@@ -84,7 +84,7 @@ class RolloutEncoder:
     def say(self, rollout: int, time_ns: int, text: str, outcome: str) -> None:
         """What was asked for, and how it ended."""
         said = f"rollout {rollout}: {text}{': ' + outcome if outcome else ''}"
-        self.file.add(self.file.channel("/instruction", *LOG), time_ns, log(said, time_ns), rollout)
+        self.file.add([(self.file.channel("/instruction", *LOG), time_ns, log(said, time_ns), rollout)])
 
     def _queue_images(
         self, queue: _Queue, entry: Entry, values: Tensor, times: Sequence[int], executed: Sequence[int] | None = None
@@ -104,7 +104,8 @@ class RolloutEncoder:
             queue[row].append((late if past else seen, time, data))
 
     def _add(self, queue: _Queue, rollouts: Sequence[int]) -> None:
-        add = self.file.add
-        for messages, rollout in zip(queue, rollouts, strict=True):
-            for channel, time, data in messages:
-                add(channel, time, data, rollout)
+        self.file.add(
+            (channel, time, data, rollout)
+            for messages, rollout in zip(queue, rollouts, strict=True)
+            for channel, time, data in messages
+        )

@@ -8,10 +8,10 @@ import fcntl
 import os
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from mcap.writer import Writer
+from worldenv_trl.record.mcap_writer import McapWriter
 
 __all__ = ["PARTIAL_SUFFIX", "McapFile"]
 
@@ -44,10 +44,10 @@ class McapFile:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._file = self._open_locked()
         self.closed = False
-        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
+        self._writer = McapWriter(self._file, _CHUNK_BYTES)
         self._schemas: dict[tuple[str, bytes], int] = {}
         self._channels: dict[str, int] = {}
-        self._call(self._writer.start, library="worldenv_trl")
+        self._call(self._writer.start, "worldenv_trl")
         self.flush()
 
     def _check_free(self) -> None:
@@ -94,19 +94,19 @@ class McapFile:
         self._call(self._writer.add_metadata, name, dict(values))
 
     def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
-        self._call(self._writer.add_attachment, 0, 0, name, media_type, data)
+        self._call(self._writer.add_attachment, name, media_type, data)
 
     def channel(self, topic: str, schema: str, data: bytes) -> int:
         """The number of the channel for a topic, made at the first call."""
         if topic not in self._channels:
             if (schema, data) not in self._schemas:
-                self._schemas[schema, data] = self._writer.register_schema(schema, "protobuf", data)
-            self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[schema, data])
+                self._schemas[schema, data] = self._writer.add_schema(schema, "protobuf", data)
+            self._channels[topic] = self._writer.add_channel(topic, "protobuf", self._schemas[schema, data])
         return self._channels[topic]
 
-    def add(self, channel: int, time_ns: int, data: bytes, rollout: int) -> None:
-        """One message; its sequence number tells the rollout."""
-        self._call(self._writer.add_message, channel, time_ns, data, time_ns, rollout)
+    def add(self, messages: Iterable[tuple[int, int, bytes, int]]) -> None:
+        """Messages: channel, time (ns), data, and the number of the rollout, which becomes the sequence number."""
+        self._call(self._writer.add_messages, messages)
 
     @property
     def size(self) -> int:

@@ -90,8 +90,8 @@ class Recorder(Transform):
     def _forget(self) -> None:
         self._stream: RolloutStream | None = None
         self._fresh: Tensor | None = None  # bool [rows]: a rollout begins with the next step
-        self._last: dict[_Path, Tensor] = {}
-        self._paths: tuple[list[_Path], list[_Path], list[_Path]] | None = None
+        self._last: dict[_Path, tuple[Tensor, Tensor]] = {}  # what each chained entry was, and its copy of active rows
+        self._paths: tuple[list[_Path], ...] | None = None  # root, next and chained entries, texts
 
     def __getstate__(self) -> dict[str, Any]:
         state = dict(super().__getstate__())
@@ -134,21 +134,20 @@ class Recorder(Transform):
         rows = active.nonzero().squeeze(-1)
         if not len(rows):
             return next_tensordict
-        roots, nexts, texts = self._paths
+        roots, nexts, chained, texts = self._paths
         batch = len(self.parent.batch_size)
         everyone = len(rows) == len(active)
+        fresh = self._fresh[rows]
+        self._check_continuity(tensordict, rows[~fresh])
         values: dict[_Path, Tensor] = {}
         for source, paths, prefix in ((tensordict, roots, ()), (next_tensordict, nexts, ("next",))):
             for path in paths:
-                value = source.get(path, None)
-                if value is None:
-                    raise ValueError(f"entry {(*prefix, *path)} is missing, it was there when recording began")
-                value = value.detach().cpu()
-                value = value.reshape(len(active), *value.shape[batch:])
+                value = _rows_of(source, path, batch, prefix)
                 # A copy: the env may reuse its memory while the value waits to be written.
                 values[*prefix, *path] = value.clone() if everyone else value[rows]
-        fresh = self._fresh[rows]
-        self._check_continuity(values, rows, fresh)
+        self._last = {path: (next_tensordict.get(path), values["next", *path]) for path in chained}
+        self._place[rows] = torch.arange(len(rows))
+        begun: dict[_Path, Tensor] = {}
         said = None
         if bool(fresh.any()):
             beginning = rows[fresh]
@@ -158,8 +157,9 @@ class Recorder(Transform):
             self._count[beginning] = 0
             sources = ((tensordict, ()), (next_tensordict, ("next",)))
             said = self._said(sources, texts, beginning)
+            begun = {path: _rows_of(tensordict, path, batch)[beginning] for path in chained}
         values[(ROW,)], values[(EPISODE,)] = rows.unsqueeze(-1), self._episode[rows].unsqueeze(-1)
-        self._stream.put(values, self._numbers[rows], self._count[rows], fresh, said)
+        self._stream.put(values, begun, self._numbers[rows], self._count[rows], fresh, said)
         self._count[rows] += 1
         self._fresh[rows] = False
         done = next_tensordict.get("done", None)
@@ -178,7 +178,14 @@ class Recorder(Transform):
         nexts, next_texts = leaves(_entries(next_tensordict))
         keep = lambda paths: [path for path in paths if path not in self._exclude]  # noqa: E731
         texts = keep(root_texts) + [("next", *path) for path in keep(next_texts)]
-        self._paths = keep(roots), keep(nexts), texts
+        # Stored once: what was seen after a step is what is seen before the next one.
+        chained = [
+            path
+            for path in keep(roots)
+            if path in nexts and (roots[path].dtype, roots[path].shape) == (nexts[path].dtype, nexts[path].shape)
+        ]
+        self._paths = [path for path in keep(roots) if path not in chained], keep(nexts), chained, texts
+        self._place = torch.zeros(count, dtype=torch.int64)
         self._numbers, self._count = torch.zeros(count, dtype=torch.int64), torch.zeros(count, dtype=torch.int64)
         self._episode, self._begun = torch.full((count,), -1), 0
         base = _innermost(self.parent)
@@ -190,6 +197,7 @@ class Recorder(Transform):
             self.path,
             self._options,
             texts,
+            rows=count,
             slot_steps=slot,
             limits=limits,
             queue_size=self._queue_size,
@@ -197,30 +205,18 @@ class Recorder(Transform):
             **self._derived,
         )
 
-    def _check_continuity(self, values: dict[_Path, Tensor], rows: Tensor, fresh: Tensor) -> None:
-        """What an env showed after a step must be what it shows before the next one: it is recorded once."""
-        going_on = (~fresh).nonzero().squeeze(-1)
-        place = self._place[rows[going_on]] if self._last else None
-        for path, last in self._last.items() if len(going_on) else ():
-            now = values[path[1:]]
-            if len(going_on) == len(now) == len(last) and torch.equal(now, last):
+    def _check_continuity(self, tensordict: TensorDictBase, rows: Tensor) -> None:
+        """What the env showed after the last step of ``rows`` must be what it shows now."""
+        for path, (shown, copy) in self._last.items() if len(rows) else ():
+            if tensordict.get(path, None) is shown:
                 continue
-            same = (to_bytes(now[going_on]) == to_bytes(last[place])).all(-1)
+            now = _rows_of(tensordict, path, len(self.parent.batch_size))[rows]
+            same = (to_bytes(now) == to_bytes(copy[self._place[rows]])).all(-1)
             if not same.all():
                 raise ValueError(
-                    f"entry {path[1:]} changed between two steps of row {int(rows[going_on[int((~same).argmax())]])}: "
-                    "the Recorder must be the outermost transform and nothing may change observations behind it, or "
-                    "exclude the entry"
+                    f"entry {path} changed between two steps of row {int(rows[int((~same).argmax())])}: the Recorder "
+                    "must be the outermost transform and nothing may change observations behind it, or exclude it"
                 )
-        self._last = {
-            path: value
-            for path, value in values.items()
-            if path[0] == "next"
-            and (root := values.get(path[1:])) is not None
-            and (root.dtype, root.shape) == (value.dtype, value.shape)
-        }
-        self._place = torch.zeros(len(self._over), dtype=torch.int64)
-        self._place[rows] = torch.arange(len(rows))
 
     def _said(self, sources: Sequence, texts: list[_Path], rows: Tensor) -> list[tuple[str, ...]]:
         """The texts of rows that begin, in the order of ``texts``."""
@@ -268,6 +264,14 @@ def recorded(env: EnvBase, path: str | os.PathLike, **options: Any) -> Transform
 def _entries(tensordict: TensorDictBase) -> TensorDictBase:
     names = [name for name in tensordict.keys() if not name.startswith("_") and name != "next"]  # noqa: SIM118
     return tensordict.select(*names)
+
+
+def _rows_of(source: TensorDictBase, path: _Path, batch: int, prefix: _Path = ()) -> Tensor:
+    """An entry [*B, ...] as [rows, ...]."""
+    value = source.get(path, None)
+    if value is None:
+        raise ValueError(f"entry {(*prefix, *path)} is missing, it was there when recording began")
+    return value.detach().cpu().flatten(0, batch - 1) if batch > 1 else value.detach().cpu()
 
 
 def _innermost(env: EnvBase) -> EnvBase:

@@ -51,6 +51,7 @@ class RolloutStream:
     Args:
         path, options: of the file.
         texts: paths of the entries that are text.
+        rows: of the env.
         slot_steps: env steps for which a viewer's time line makes room for each rollout.
         limits: int64 [rows], env steps after which a rollout is truncated, if known: one that ends earlier was cut
             short.
@@ -65,6 +66,7 @@ class RolloutStream:
         options: Mapping[str, Any],
         texts: Sequence[_Path],
         *,
+        rows: int,
         slot_steps: int,
         limits: Tensor | None,
         queue_size: int,
@@ -76,6 +78,7 @@ class RolloutStream:
         self._file = open_file(path, options["metadata"], options["attachments"], options["overwrite"])
         self._texts, self._slot_steps, self._limits, self._proprio = list(texts), slot_steps, limits, proprio
         self._kinematics, self._action_map, self._hand = kinematics, action_map, kinematics
+        self._rows, self._before = rows, None  # kinematic states [rows, 20] before the step
         self._encoder: RolloutEncoder | None = None
         self._starts: list[int] = []
         self._lengths: list[int] = []
@@ -95,13 +98,18 @@ class RolloutStream:
     def put(
         self,
         values: dict[_Path, Tensor],
+        begun: dict[_Path, Tensor],
         numbers: Tensor,
         steps: Tensor,
         fresh: Tensor,
         said: list[tuple[str, ...]] | None,
     ) -> None:
-        """Entries [n, ...] of the rollouts ``numbers`` [n] at ``steps`` [n]; ``fresh`` ones begin, with these texts."""
-        self._hand_over(lambda: self._write(values, numbers.tolist(), steps.tolist(), fresh, said))
+        """Entries [n, ...] of the rollouts ``numbers`` [n] at ``steps`` [n].
+
+        ``fresh`` ones begin: with the observations ``begun`` [f, ...] and these texts. An entry in ``begun`` is given
+        after the step only.
+        """
+        self._hand_over(lambda: self._write(values, begun, numbers.tolist(), steps.tolist(), fresh, said))
 
     def annotate(self, entries: TensorDictBase, rollouts: Sequence[int]) -> None:
         self._wait_for(lambda: self._annotator.write(entries, rollouts))
@@ -167,17 +175,18 @@ class RolloutStream:
     def _write(
         self,
         values: dict[_Path, Tensor],
+        begun: dict[_Path, Tensor],
         numbers: list[int],
         steps: list[int],
         fresh: Tensor,
         said: list[tuple[str, ...]] | None,
     ) -> None:
         with torch.no_grad():
-            self._derive(values)
+            self._derive(values, begun, fresh)
         self._begin_texts(said)
         values[(TEXT,)] = torch.tensor([[self._said_of[number]] for number in numbers])
         if self._encoder is None:
-            flat = {key: value.unsqueeze(1) for key, value in values.items()}
+            flat = {key: value.unsqueeze(1) for key, value in (values | begun).items()}
             layout = Layout.of(flat, self._texts, torch.ones(len(numbers), 1, dtype=torch.bool))
             self._file.write_metadata(
                 f"{FORMAT}.stream", {"json": json.dumps({"layout": layout.to_json(), "prefix": ""})}
@@ -192,9 +201,6 @@ class RolloutStream:
         beginning = fresh.nonzero().squeeze(-1)
         if len(beginning):
             first = [numbers[place] for place in beginning.tolist()]
-            begun = {
-                e.key: values[e.key][beginning] for e in (*self._layout.numbers, *self._layout.images) if e.chained
-            }
             self._encoder.reset(first, [self._starts[number] for number in first], begun)
         self._encoder.steps(numbers, steps, [self._starts[number] for number in numbers], values)
         for number in numbers:
@@ -213,15 +219,22 @@ class RolloutStream:
                 self._file.write_metadata(f"{FORMAT}.texts", {"json": json.dumps(value)})
             self._said_of.append(self._said.index(words))
 
-    def _derive(self, values: dict[_Path, Tensor]) -> None:
+    def _derive(self, values: dict[_Path, Tensor], begun: dict[_Path, Tensor], fresh: Tensor) -> None:
         """Adds the entries that are the recorder's own."""
-        if self._kinematics is not None and (KINEMATIC_STATE,) in values and (ACTION,) in values:
-            predicted = self._kinematics(values[(KINEMATIC_STATE,)], values[(ACTION,)])
+        after = values.get(("next", KINEMATIC_STATE))
+        if self._kinematics is not None and after is not None and (ACTION,) in values:
+            rows = values[(ROW,)].flatten()
+            if self._before is None:
+                self._before = after.new_zeros(self._rows, after.shape[-1])
+            if bool(fresh.any()):
+                self._before[rows[fresh]] = begun[(KINEMATIC_STATE,)]
+            predicted = self._kinematics(self._before[rows], values[(ACTION,)])
             values["next", PREDICTED_STATE] = self._kinematics.state(predicted, self._proprio)
-        if self._action_map is not None and ("next", KINEMATIC_STATE) in values:
+            self._before[rows] = after
+        if self._action_map is not None and after is not None:
             self._hand = self._hand or ForwardKinematics()
-            pose = self._hand.pose(values["next", KINEMATIC_STATE])
-            values["next", ACTION_MAP] = painted(self._action_map(pose, values.get((TASK_ID,))))
+            pose = self._hand.pose(after)
+            values["next", ACTION_MAP] = painted(self._action_map(pose, values.get(("next", TASK_ID))))
         ended = [values.get(("next", name)) for name in ("terminated", "truncated")]
         if None not in ended:
             values["next", TERMINATION] = self._causes(values, *ended)
