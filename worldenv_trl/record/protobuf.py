@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -147,6 +148,7 @@ def _header(number: int, field: MessageField) -> bytes:
     return varint(number << 3 | _WIRE[kind])
 
 
+@lru_cache(65536)
 def varint(value: int) -> bytes:
     """A protobuf varint."""
     out = bytearray()

@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -16,9 +16,11 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, MultiAction, Transform, TransformedEnv
 
 from worldenv_trl.keys import EPISODE, ROW
-from worldenv_trl.kinematics import ActionMap, ForwardKinematics
 from worldenv_trl.record.layout import leaves, to_bytes
 from worldenv_trl.record.stream import RolloutStream
+
+if TYPE_CHECKING:
+    from worldenv_trl.kinematics import ActionMap, ForwardKinematics
 
 __all__ = ["Recorder", "recorded"]
 

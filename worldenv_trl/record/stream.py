@@ -8,7 +8,7 @@ import threading
 import weakref
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -31,13 +31,15 @@ from worldenv_trl.keys import (
     TERMINATION,
     TERMINATIONS,
 )
-from worldenv_trl.kinematics import ActionMap, ForwardKinematics
 from worldenv_trl.record.annotations import Annotator
 from worldenv_trl.record.encoder import PERIOD_NS, RolloutEncoder
 from worldenv_trl.record.layout import Layout
 from worldenv_trl.record.mcap_file import FLUSH_SECONDS
 from worldenv_trl.record.recording import TEXT
 from worldenv_trl.record.writer import FORMAT, open_file
+
+if TYPE_CHECKING:
+    from worldenv_trl.kinematics import ActionMap, ForwardKinematics
 
 __all__ = ["RolloutStream", "painted"]
 
@@ -232,7 +234,10 @@ class RolloutStream:
             values["next", PREDICTED_STATE] = self._kinematics.state(predicted, self._proprio)
             self._before[rows] = after
         if self._action_map is not None and after is not None:
-            self._hand = self._hand or ForwardKinematics()
+            if self._hand is None:
+                from worldenv_trl.kinematics import ForwardKinematics  # builds on MuJoCo; reading does not need it
+
+                self._hand = ForwardKinematics()
             pose = self._hand.pose(after)
             values["next", ACTION_MAP] = painted(self._action_map(pose, values.get(("next", TASK_ID))))
         ended = [values.get(("next", name)) for name in ("terminated", "truncated")]
