@@ -141,8 +141,8 @@ def test_changed_bytes_lose_their_chunk_and_nothing_else(tmp_path):
     (tmp_path / "a.mcap").write_bytes(data)
     with pytest.warns(UserWarning, match=r"a\.mcap is damaged behind byte .*: 40 complete steps .* least 20 more"):
         read = read_rollouts(tmp_path / "a.mcap")
-    assert read[keys.MASK].sum(-1).tolist() == [10, 10, 0, 0, 10, 10]
-    for rows, part in ((slice(0, 2), parts[0]), (slice(4, 6), parts[2])):
+    assert read[keys.MASK].sum(-1).tolist() == [10] * 4
+    for rows, part in ((slice(0, 2), parts[0]), (slice(2, 4), parts[2])):
         assert torch.equal(read[rows][keys.IMAGE], part[keys.IMAGE])
         assert torch.equal(read[rows][keys.ACTION], part[keys.ACTION])
 
@@ -167,8 +167,8 @@ def test_bytes_that_hide_where_a_record_ends_lose_one_chunk(tmp_path):
     (tmp_path / "a.mcap").write_bytes(data)
     with pytest.warns(UserWarning, match=r"is damaged between byte \d+ and byte \d+: 40 complete"):
         read = read_rollouts(tmp_path / "a.mcap")
-    assert read[keys.MASK].sum(-1).tolist() == [10, 10, 0, 0, 10, 10]
-    assert torch.equal(read[4:][keys.IMAGE], parts[2][keys.IMAGE])
+    assert read[keys.MASK].sum(-1).tolist() == [10] * 4
+    assert torch.equal(read[2:][keys.IMAGE], parts[2][keys.IMAGE])
 
 
 def test_repair_keeps_every_complete_message_and_the_damaged_file(tmp_path):
@@ -197,7 +197,7 @@ def test_repair_keeps_every_complete_message_and_the_damaged_file(tmp_path):
     with pytest.raises(ValueError, match="another name"):
         repair(cut, cut)
     (tmp_path / "empty.mcap").write_bytes(data[:400])
-    with pytest.raises(ValueError, match="no complete message|written by another"):
+    with pytest.raises(ValueError, match=r"no complete message|written by another"):
         repair(tmp_path / "empty.mcap")
 
 
