@@ -115,7 +115,7 @@ def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path):
     with pytest.raises(FileExistsError, match="overwrite=True"):
         write_lerobot(make_rollouts(), folder)
     broken = make_rollouts()
-    broken["next", *keys.STATE] += 1
+    broken["next", *keys.STATE] = broken["next", *keys.STATE] + 1  # not in place: root and next share memory
     with pytest.raises(ValueError, match=r"'state'\) before a step is not what it was after the one before"):
         write_lerobot(broken, folder, overwrite=True)
     with pytest.raises(ValueError, match="needs images and one 'action' an entry"):

@@ -273,7 +273,7 @@ def test_a_missing_channel_is_named(tmp_path):
             channel = scan.channels[number]
             if channel.topic != topic:
                 schema = scan.schemas[channel.schema_id]
-                file.add([(file.channel(channel.topic, schema.name, schema.data), time, bytes(data), sequence)])
+                file.add(file.channel(channel.topic, schema.name, schema.data), time, bytes(data), sequence)
         file.close()
         with pytest.raises(ValueError, match=said):
             read_rollouts(tmp_path / "b.mcap")

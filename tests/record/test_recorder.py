@@ -119,13 +119,13 @@ def test_steps_reach_the_disk_within_a_second_while_the_env_pauses(tmp_path):
 
 
 def test_a_slow_disk_makes_the_env_wait_and_loses_nothing(tmp_path, monkeypatch):
-    real = McapWriter.add_messages
+    real = McapWriter.block
 
-    def slow(self, messages):
-        time.sleep(0.01)
-        real(self, messages)
+    def slow(self, *arguments):
+        time.sleep(0.005)
+        return real(self, *arguments)
 
-    monkeypatch.setattr(McapWriter, "add_messages", slow)
+    monkeypatch.setattr(McapWriter, "block", slow)
     env = recorded(make_env(max_steps=20), tmp_path / "a.mcap", queue_size=1)
     rollouts = env.rollout(20, break_when_any_done=False)
     env.close()
@@ -137,10 +137,10 @@ def test_a_full_disk_is_raised_in_the_env_and_what_is_complete_stays(tmp_path, m
     env.rollout(3, break_when_any_done=False)
     env.transform.flush()
 
-    def full(self, messages):
+    def full(self, *_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(McapWriter, "add_messages", full)
+    monkeypatch.setattr(McapWriter, "block", full)
     with pytest.raises(OSError, match="the disk is full"):
         for _ in range(100):
             env.rollout(1, break_when_any_done=False)

@@ -62,8 +62,9 @@ class Annotator:
                 continue
             values = [flat[e.key if e.stored == "root" else ("next", *e.key)][row, :length] for e in layout.numbers]
             index = np.stack([np.full(length, number, np.int64), np.arange(length, dtype=np.int64)])[..., None]
-            packed = message.pack([*index.view(np.uint8), *map(to_bytes, values)])
-            self._file.add((channel, self._time(number, step), data, number) for step, data in enumerate(packed))
+            times = np.array([self._time(number, step) for step in range(length)])
+            body = self._file.block(channel, times, np.full(length, number), message.nbytes)
+            message.fill(body, [*index.view(np.uint8), *map(to_bytes, values)])
         self._file.flush()
 
 

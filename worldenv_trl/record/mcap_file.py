@@ -8,8 +8,11 @@ import fcntl
 import os
 import shutil
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from worldenv_trl.record.mcap_writer import McapWriter
 
@@ -104,9 +107,17 @@ class McapFile:
             self._channels[topic] = self._writer.add_channel(topic, "protobuf", self._schemas[schema, data])
         return self._channels[topic]
 
-    def add(self, messages: Iterable[tuple[int, int, bytes, int]]) -> None:
-        """Messages: channel, time (ns), data, and the number of the rollout, which becomes the sequence number."""
-        self._call(self._writer.add_messages, messages)
+    def block(self, channel: int, times_ns: np.ndarray, rollouts: np.ndarray, size: int) -> np.ndarray:
+        """Messages of ``size`` bytes of a channel, to be filled by the caller: uint8 [n, size].
+
+        Their sequence numbers are the numbers of the rollouts they belong to.
+        """
+        return self._call(self._writer.block, channel, times_ns, rollouts, size)
+
+    def add(self, channel: int, time_ns: int, data: bytes, rollout: int) -> None:
+        """One message."""
+        body = self.block(channel, np.array([time_ns]), np.array([rollout]), len(data))
+        body[0] = np.frombuffer(data, np.uint8)
 
     @property
     def size(self) -> int:
@@ -122,11 +133,11 @@ class McapFile:
         if time.monotonic() - self._flushed > FLUSH_SECONDS:
             self.flush()
 
-    def _call(self, method, *arguments, **named) -> None:
+    def _call(self, method, *arguments) -> Any:
         if self.closed:
             raise ValueError(f"the writer of {self.path} is closed")
         try:
-            method(*arguments, **named)
+            return method(*arguments)
         except OSError as error:
             self.abort()
             hint = ": the disk is full, make room" if error.errno == errno.ENOSPC else ""

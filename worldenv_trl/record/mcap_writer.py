@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterable
 from typing import BinaryIO
 
+import numpy as np
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -19,7 +19,6 @@ from mcap.records import (
     DataEnd,
     Header,
     McapRecord,
-    MessageIndex,
     Metadata,
     MetadataIndex,
     Schema,
@@ -31,7 +30,16 @@ __all__ = ["McapWriter"]
 
 _MAGIC = b"\x89MCAP0\r\n"
 _LEVEL = 2  # 15 % faster than 3 for 4 % more bytes
-_MESSAGE = struct.Struct("<BQHIQQ")
+_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
 _FOOTER = struct.Struct("<BQQQ")
 
 
@@ -90,20 +98,25 @@ class McapWriter:
         self._append(_bytes(channel))
         return channel.id
 
-    def add_messages(self, messages: Iterable[tuple[int, int, bytes, int]]) -> None:
-        """Messages: channel, time (ns), data, sequence number."""
-        pack, parts, index, offset = _MESSAGE.pack, self._parts, self._index, self._offset
-        for channel, time, data, sequence in messages:
-            size = len(data)
-            parts.append(pack(5, 22 + size, channel, sequence, time, time))
-            parts.append(data)
-            if channel not in index:
-                index[channel] = []
-            index[channel].append((time, offset))
-            offset += 31 + size
-        self._offset = offset
-        if offset > self._chunk_size:
+    def block(self, channel: int, times: np.ndarray, sequences: np.ndarray, size: int) -> np.ndarray:
+        """Messages of a channel that all have ``size`` bytes; the caller fills the array that it gets, uint8 [n, size].
+
+        Args:
+            times: int64 [n], ns.
+            sequences: [n], their sequence numbers.
+        """
+        if self._offset > self._chunk_size:
             self._end_chunk()
+        records = np.empty((len(times), _HEAD.itemsize + size), np.uint8)
+        head = np.empty(len(times), _HEAD)
+        head["opcode"], head["length"], head["channel"] = Opcode.MESSAGE, _HEAD.itemsize - 9 + size, channel
+        head["sequence"], head["log_time"], head["publish_time"] = sequences, times, times
+        records[:, : _HEAD.itemsize] = head.view(np.uint8).reshape(len(times), -1)
+        places = self._offset + records.shape[1] * np.arange(len(times))
+        self._index.setdefault(channel, []).append(np.stack([times, places], -1))
+        self._parts.append(records)
+        self._offset += records.size
+        return records[:, _HEAD.itemsize :]
 
     def flush(self) -> None:
         """Ends the chunk and hands everything to the stream's operating system."""
@@ -115,8 +128,8 @@ class McapWriter:
         self._offset += len(record)
 
     def _begin_chunk(self) -> None:
-        self._parts: list[bytes] = []
-        self._index: dict[int, list[tuple[int, int]]] = {}
+        self._parts: list[bytes | np.ndarray] = []
+        self._index: dict[int, list[np.ndarray]] = {}  # of each channel: times and places [n, 2]
         self._offset = 0
 
     def _end_chunk(self) -> None:
@@ -124,23 +137,24 @@ class McapWriter:
             return
         data = b"".join(self._parts)
         packed = self._compressor.compress(data)
-        times = [time for each in self._index.values() for time, _ in each]
+        entries = {channel: np.concatenate(parts) for channel, parts in self._index.items()}
         chunk = Chunk(
             compression="zstd",
             data=packed,
-            message_start_time=min(times),
-            message_end_time=max(times),
+            message_start_time=min(int(each[:, 0].min()) for each in entries.values()),
+            message_end_time=max(int(each[:, 0].max()) for each in entries.values()),
             uncompressed_crc=zlib.crc32(data),
             uncompressed_size=len(data),
         )
         start, record = self._stream.tell(), _bytes(chunk)
         offsets, indices, place = {}, [], start + len(record)
-        for channel, entries in self._index.items():
-            index = _bytes(MessageIndex(channel_id=channel, records=entries))
+        for channel, each in entries.items():
+            body = struct.pack("<HI", channel, each.nbytes) + each.astype("<u8").tobytes()
+            index = struct.pack("<BQ", Opcode.MESSAGE_INDEX, len(body)) + body
             offsets[channel] = place
             place += len(index)
             indices.append(index)
-            self._counts[channel] = self._counts.get(channel, 0) + len(entries)
+            self._counts[channel] = self._counts.get(channel, 0) + len(each)
         self._chunks.append(
             ChunkIndex(
                 message_start_time=chunk.message_start_time,
@@ -197,10 +211,6 @@ class McapWriter:
 
 
 def _bytes(record: McapRecord) -> bytes:
-    if isinstance(record, MessageIndex):
-        flat = [number for entry in record.records for number in entry]
-        body = struct.pack(f"<HI{len(flat)}Q", record.channel_id, 8 * len(flat), *flat)
-        return struct.pack("<BQ", Opcode.MESSAGE_INDEX, len(body)) + body
     builder = RecordBuilder()
     record.write(builder)
     return builder.end()

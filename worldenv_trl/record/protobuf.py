@@ -61,12 +61,15 @@ class FixedMessage:
 
     def pack(self, values: list[np.ndarray]) -> list[bytes]:
         """Messages from the fields' raw bytes, uint8 [n, nbytes of the field] each."""
-        count = len(values[0])
-        packed = np.broadcast_to(self._template, (count, self.nbytes)).copy()
-        for place, value in zip(self._places, values, strict=True):
-            packed[:, place] = value
-        joined = packed.tobytes()
+        joined = self.fill(np.empty((len(values[0]), self.nbytes), np.uint8), values).tobytes()
         return [joined[start : start + self.nbytes] for start in range(0, len(joined), self.nbytes)]
+
+    def fill(self, messages: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
+        """Writes messages uint8 [n, nbytes] in place, from the fields' raw bytes, and returns them."""
+        messages[:] = self._template
+        for place, value in zip(self._places, values, strict=True):
+            messages[:, place] = value
+        return messages
 
     def unpack(self, messages: list[bytes]) -> list[np.ndarray]:
         """The fields' raw bytes, uint8 [n, nbytes of the field] each.

@@ -70,7 +70,8 @@ def repair(path: str | os.PathLike, target: str | os.PathLike | None = None, *, 
                     channel = scan.channels[number]
                     schema = scan.schemas[channel.schema_id]
                     channels[number] = file.channel(channel.topic, schema.name, schema.data)
-            file.add((channels[number], time, data, sequence) for number, sequence, time, data in messages)
+            for number, sequence, time, data in messages:
+                file.add(channels[number], time, data, sequence)
     except BaseException:
         file.abort()
         file.partial.unlink(missing_ok=True)

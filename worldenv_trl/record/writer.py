@@ -23,7 +23,7 @@ __all__ = ["FORMAT", "VERSION", "RolloutWriter", "open_file"]
 FORMAT, VERSION = "worldenv_trl.rollouts", 2
 _FIRST_GUESS = 0.5  # compressed size over raw size, before anything was measured
 _MEASURED = 16 * 2**20  # bytes
-_STEPS_AT_ONCE = 64
+_STEPS_AT_ONCE = 8  # of a file that is cut off, so many may be lost
 
 
 def open_file(
