@@ -143,7 +143,7 @@ class McapWriter:
             data=packed,
             message_start_time=min(int(each[:, 0].min()) for each in entries.values()),
             message_end_time=max(int(each[:, 0].max()) for each in entries.values()),
-            uncompressed_crc=0,  # zstd's own checksum costs a tenth of it
+            uncompressed_crc=0,  # zstd checks its own, faster
             uncompressed_size=len(data),
         )
         start, record = self._stream.tell(), _bytes(chunk)

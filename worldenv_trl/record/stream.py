@@ -246,6 +246,8 @@ class RolloutStream:
 
     def _causes(self, values: dict[_Path, Tensor], terminated: Tensor, truncated: Tensor) -> Tensor:
         """int64 [n, 1]."""
+        if not bool((terminated | truncated).any()):
+            return torch.zeros_like(terminated, dtype=torch.int64)
         success, judged = values.get(("next", SUCCESS)), ("next", SUCCESS_PROB) in values
         reached = torch.zeros_like(terminated) if success is None else success.reshape(terminated.shape)
         by_goal = torch.full_like(terminated, TERMINATIONS.index("success"), dtype=torch.int64)
