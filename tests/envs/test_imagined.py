@@ -18,6 +18,7 @@ from worldenv_trl.keys import (
     INSTRUCTION,
     KINEMATIC_STATE,
     KINEMATIC_STATES,
+    NOISE_SEED,
     NUM_STEPS,
     STATE,
     STATES,
@@ -26,6 +27,7 @@ from worldenv_trl.keys import (
     TASK_ID,
 )
 from worldenv_trl.kinematics import ForwardKinematics
+from worldenv_trl.record import read_rollouts, recorded
 from worldenv_trl.scenes import list_tasks, panda
 
 SIZE, C = 16, 4
@@ -351,7 +353,7 @@ def test_physics_and_imagination_have_the_same_interface():
     physics, imagination = leaves(real.observation_spec), leaves(env.observation_spec)
     shared = set(physics) - {SUCCESS}
     assert {key: imagination[key] for key in shared} == {key: physics[key] for key in shared}
-    assert set(imagination) - set(physics) == {FRAMES, STATES, KINEMATIC_STATES}
+    assert set(imagination) - set(physics) == {FRAMES, STATES, KINEMATIC_STATES, NOISE_SEED}
     assert env.action_keys == real.action_keys == [CHUNK]  # MultiAction leaves its spec's chunk length open (-1)
     assert env.full_action_spec[CHUNK].shape[-1] == real.full_action_spec[CHUNK].shape[-1] == 7
     assert leaves(env.full_done_spec) == leaves(real.full_done_spec)
@@ -364,3 +366,19 @@ def test_physics_and_imagination_have_the_same_interface():
     columns = [0, 1, 2, 6]
     assert torch.allclose(imagined[STATE].flatten(0, 1)[:, columns], after[STATE][:, columns], atol=1e-5)
     real.close()
+
+
+def test_a_recording_holds_the_noise_seeds_that_paint_its_frames_again(tmp_path):
+    env = recorded(make_env(), tmp_path / "a.mcap")
+    rollouts = env.rollout(3, break_when_any_done=False).reshape(-1, 3)
+    world_model = env.base_env.world_model
+    env.close()
+    read = read_rollouts(tmp_path / "a.mcap")
+    for key in (FRAMES, IMAGE, NOISE_SEED, KINEMATIC_STATES, STEP_MASK):
+        assert torch.equal(read["next", key] if isinstance(key, str) else read["next", *key], rollouts["next", key])
+    assert torch.equal(read[CHUNK], rollouts[CHUNK])
+    for decision, request in enumerate(world_model.requests):
+        assert torch.equal(read["next", NOISE_SEED][:, decision], request["noise_seed"])
+        assert torch.equal(world_model(request)[FRAMES], read["next", FRAMES][:, decision])
+        if decision == 2:
+            break

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 import re
 import signal
@@ -10,11 +11,13 @@ import warnings
 
 import pytest
 import torch
+from mcap.reader import make_reader
 from tensordict import NonTensorData, TensorDict
 
 from worldenv_trl import keys
-from worldenv_trl.record import RolloutWriter, read_attachments, read_metadata, read_rollouts
-from worldenv_trl.record import writer as writer_module
+from worldenv_trl.record import RolloutWriter, mcap_file, read_attachments, read_metadata, read_rollouts, repair
+from worldenv_trl.record.mcap_file import McapFile
+from worldenv_trl.record.scan import McapScan
 
 
 def make_rollouts(rows: int = 4, steps: int = 10, size: int = 32) -> TensorDict:
@@ -128,12 +131,159 @@ def test_a_killed_process_leaves_what_it_wrote(tmp_path):
     assert int(read[keys.MASK].sum()) >= 5 * 64
 
 
-def test_changed_bytes_are_noticed(tmp_path):
+def test_changed_bytes_lose_their_chunk_and_nothing_else(tmp_path):
+    parts = make_rollouts(6).split(2)
+    with RolloutWriter(tmp_path / "a.mcap") as writer:
+        for part in parts:
+            writer.write(part)
+    data = bytearray((tmp_path / "a.mcap").read_bytes())
+    data[len(data) // 2] ^= 0x40  # in the second write
+    (tmp_path / "a.mcap").write_bytes(data)
+    with pytest.warns(UserWarning, match=r"a\.mcap is damaged behind byte .*: 40 complete steps .* least 20 more"):
+        read = read_rollouts(tmp_path / "a.mcap")
+    assert read[keys.MASK].sum(-1).tolist() == [10] * 4
+    for rows, part in ((slice(0, 2), parts[0]), (slice(2, 4), parts[2])):
+        assert torch.equal(read[rows][keys.IMAGE], part[keys.IMAGE])
+        assert torch.equal(read[rows][keys.ACTION], part[keys.ACTION])
+
+
+def test_a_file_whose_only_chunk_is_damaged_is_refused(tmp_path):
     record(tmp_path / "a.mcap", make_rollouts())
     data = bytearray((tmp_path / "a.mcap").read_bytes())
     data[len(data) // 2] ^= 0x40
     (tmp_path / "a.mcap").write_bytes(data)
-    with pytest.raises(ValueError, match=r"a\.mcap is damaged behind byte"):
+    with pytest.raises(ValueError, match=r"holds no rollouts: .*damaged behind byte"):
+        read_rollouts(tmp_path / "a.mcap")
+
+
+def test_bytes_that_hide_where_a_record_ends_lose_one_chunk(tmp_path):
+    parts = make_rollouts(6).split(2)
+    with RolloutWriter(tmp_path / "a.mcap") as writer:
+        for part in parts:
+            writer.write(part)
+    chunk = McapScan(tmp_path / "a.mcap").chunks[1]
+    data = bytearray((tmp_path / "a.mcap").read_bytes())
+    data[chunk.position : chunk.position + 9] = b"\xff" * 9  # the head of the second chunk
+    (tmp_path / "a.mcap").write_bytes(data)
+    with pytest.warns(UserWarning, match=r"is damaged between byte \d+ and byte \d+: 40 complete"):
+        read = read_rollouts(tmp_path / "a.mcap")
+    assert read[keys.MASK].sum(-1).tolist() == [10] * 4
+    assert torch.equal(read[2:][keys.IMAGE], parts[2][keys.IMAGE])
+
+
+def test_repair_keeps_every_complete_message_and_the_damaged_file(tmp_path):
+    rollouts = make_rollouts(8, 20, 64)
+    with RolloutWriter(tmp_path / "whole.mcap", metadata={"seed": 1}, attachments={"note": "hello"}) as writer:
+        writer.write(rollouts)
+    with pytest.raises(ValueError, match="is whole"):
+        repair(tmp_path / "whole.mcap")
+    data = (tmp_path / "whole.mcap").read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: len(data) // 2])
+    with pytest.warns(UserWarning, match="truncated"):
+        before = read_rollouts(cut)
+    done = repair(cut)
+    assert done.target == tmp_path / "cut.repaired.mcap" and "truncated" in done.lost[0]
+    assert cut.stat().st_size == len(data) // 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        after = read_rollouts(done.target)
+    assert all(torch.equal(after[key], before[key]) for key in (keys.IMAGE, keys.ACTION, keys.MASK))
+    assert read_metadata(done.target) == {"seed": 1} and read_attachments(done.target) == {"note": b"hello"}
+    with open(done.target, "rb") as file:  # a whole file for others, too
+        assert make_reader(file).get_summary().statistics.message_count == done.messages
+    with pytest.raises(FileExistsError, match="overwrite=True"):
+        repair(cut)
+    with pytest.raises(ValueError, match="another name"):
+        repair(cut, cut)
+    (tmp_path / "empty.mcap").write_bytes(data[:400])
+    with pytest.raises(ValueError, match=r"no complete message|written by another"):
+        repair(tmp_path / "empty.mcap")
+
+
+def test_a_disk_that_fills_up_while_writing_leaves_what_is_complete(tmp_path, monkeypatch):
+    rollouts = make_rollouts(4, 40, 64)
+    record(tmp_path / "a.mcap", rollouts[:1])
+    writer = RolloutWriter(tmp_path / "a.mcap", overwrite=True)
+    writer.write(rollouts[:2])
+    real, left = writer._file._writer._stream.write, 100_000
+
+    class Full:
+        def write(self, data):
+            nonlocal left
+            if len(data) > left:
+                real(data[:left])
+                raise OSError(errno.ENOSPC, "No space left on device")
+            left -= len(data)
+            return real(data)
+
+        def __getattr__(self, name):
+            return getattr(writer._file._file, name)
+
+    writer._file._writer._stream = Full()
+    with pytest.raises(OSError, match=r"a\.mcap could not be written: the disk is full.*a\.partial\.mcap"):
+        writer.write(rollouts[2:])
+    with pytest.raises(ValueError, match="closed"):
+        writer.write(rollouts[2:])
+    writer.close()
+    assert len(read_rollouts(tmp_path / "a.mcap")) == 1  # the good file is untouched
+    with pytest.warns(UserWarning, match="truncated"):
+        read = read_rollouts(tmp_path / "a.partial.mcap")
+    assert assert_prefix(read, rollouts) >= 80
+
+
+def test_two_writers_on_one_path_are_refused(tmp_path):
+    with RolloutWriter(tmp_path / "a.mcap") as writer:
+        for overwrite in (False, True):
+            with pytest.raises(FileExistsError, match=r"a\.mcap is being written by another writer"):
+                RolloutWriter(tmp_path / "a.mcap", overwrite=overwrite)
+        writer.write(make_rollouts(2))
+    assert len(read_rollouts(tmp_path / "a.mcap")) == 2
+
+
+def test_an_unfinished_recording_is_not_overwritten_by_accident(tmp_path):
+    with pytest.raises(RuntimeError, match="stop"), RolloutWriter(tmp_path / "a.mcap") as writer:
+        writer.write(make_rollouts(2))
+        raise RuntimeError("stop")
+    with pytest.raises(FileExistsError, match=r"unfinished recording is in .*recipes/repair\.py"):
+        RolloutWriter(tmp_path / "a.mcap")
+    assert len(read_rollouts(tmp_path / "a.partial.mcap")) == 2
+    RolloutWriter(tmp_path / "a.mcap", overwrite=True).close()
+
+
+def test_a_file_that_appears_meanwhile_is_kept(tmp_path):
+    writer = RolloutWriter(tmp_path / "a.mcap")
+    writer.write(make_rollouts(2))
+    (tmp_path / "a.mcap").write_bytes(b"precious")
+    with pytest.raises(FileExistsError, match="overwrite=True"):
+        writer.close()
+    assert (tmp_path / "a.mcap").read_bytes() == b"precious"
+    assert len(read_rollouts(tmp_path / "a.partial.mcap")) == 2
+
+
+def test_a_missing_channel_is_named(tmp_path):
+    record(tmp_path / "a.mcap", make_rollouts(2))
+    for topic, said in (("/step", "0 of 20 steps"), ("/observation/image", "lacks images on /observation/image")):
+        scan = McapScan(tmp_path / "a.mcap")
+        messages = [message for chunk in scan.chunks for message in scan.messages(chunk)]
+        file = McapFile(tmp_path / "b.mcap", overwrite=True)
+        for each in scan.metadata:
+            file.write_metadata(each.name, each.metadata)
+        for number, sequence, time, data in messages:
+            channel = scan.channels[number]
+            if channel.topic != topic:
+                schema = scan.schemas[channel.schema_id]
+                file.add(file.channel(channel.topic, schema.name, schema.data), time, bytes(data), sequence)
+        file.close()
+        with pytest.raises(ValueError, match=said):
+            read_rollouts(tmp_path / "b.mcap")
+
+
+def test_a_later_format_is_refused(tmp_path):
+    file = McapFile(tmp_path / "a.mcap")
+    file.write_metadata("worldenv_trl.rollouts", {"version": "99"})
+    file.close()
+    with pytest.raises(ValueError, match=r"format version 99, this release reads up to \d: update"):
         read_rollouts(tmp_path / "a.mcap")
 
 
@@ -190,7 +340,7 @@ def test_an_exception_leaves_the_partial_file_and_no_final_one(tmp_path):
 def test_a_full_disk_is_noticed_before_writing(tmp_path, monkeypatch):
     writer = RolloutWriter(tmp_path / "a.mcap")
     usage = type("Usage", (), {"free": 100_000})
-    monkeypatch.setattr(writer_module.shutil, "disk_usage", lambda _: usage)
+    monkeypatch.setattr(mcap_file.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(OSError, match=r"MiB free: make room"):
         writer.write(make_rollouts(8))
     writer.write(make_rollouts(1, 1, 16))

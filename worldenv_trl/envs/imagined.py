@@ -20,6 +20,7 @@ from worldenv_trl.keys import (
     KINEMATIC_DIM,
     KINEMATIC_STATE,
     KINEMATIC_STATES,
+    NOISE_SEED,
     NUM_STEPS,
     POSE_DIM,
     STATE,
@@ -142,6 +143,7 @@ class ImaginedEnv(EnvBase):
                 FRAMES: pixels(chunk, *image),
                 STATES: real(chunk, STATE_DIM),
                 KINEMATIC_STATES: real(chunk, KINEMATIC_DIM),
+                NOISE_SEED: integer(),
                 STEP_MASK: Binary(shape=(*batch, chunk), dtype=torch.bool, device=self.device),
             },
         )
@@ -288,7 +290,7 @@ class ImaginedEnv(EnvBase):
         poses = self.kinematics.pose(kinematic)
         states = self.kinematics.state(kinematic, self.proprio)
         memory = self.world_model.memory_indices(now)
-        recalled = rows.unsqueeze(-1)
+        recalled, seeds = rows.unsqueeze(-1), self._noise_seeds(rows)
         request = TensorDict(
             {
                 "memory": {
@@ -299,7 +301,7 @@ class ImaginedEnv(EnvBase):
                 "poses": poses,
                 "padded_actions": torch.nn.functional.pad(actions, (0, _PADDED_ACTION_DIM - ACTION_DIM)),
                 TASK_ID: self._task[rows],
-                "noise_seed": self._noise_seeds(rows),
+                NOISE_SEED: seeds,
             },
             batch_size=[count],
             device=self.device,
@@ -330,6 +332,7 @@ class ImaginedEnv(EnvBase):
             (STATE, states[last]),
             (KINEMATIC_STATE, kinematic[last]),
             (NUM_STEPS, self._steps[rows].unsqueeze(-1)),
+            (NOISE_SEED, seeds),
         ):
             out[key].flatten(0, 1)[rows] = value  # a view: written in place
 
@@ -376,6 +379,7 @@ class ImaginedEnv(EnvBase):
                 FRAMES: empty(*self._video.shape[2:], dtype=torch.uint8),
                 STATES: empty(STATE_DIM),
                 KINEMATIC_STATES: empty(KINEMATIC_DIM),
+                NOISE_SEED: torch.zeros(*batch, 1, dtype=torch.int64, device=self.device),
                 STEP_MASK: empty(dtype=torch.bool),
             },
             batch_size=batch,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,13 +29,15 @@ _SCALAR = FixedMessage(
     "worldenv_trl.Scalar", [MessageField("value", torch.float64, 1), MessageField("step", torch.int64, 1)]
 )
 _NO_STEP = -1
+_FLUSH_SECONDS = 0.5
 
 
 class MCAPLogger(Logger):
     """Writes ``<log_dir>/<exp_name>.mcap``: one plottable topic for each scalar, videos as raw images.
 
     Scalars are ``worldenv_trl.Scalar`` messages (``value``, ``step``; -1 without a step) on ``/<name>``, stamped with
-    the time of logging. Everything logged is on disk after :meth:`flush`, also when the process is killed later.
+    the time of logging. What was logged is on disk after :meth:`flush`, or half a second later, also when the process
+    is killed then.
 
     Args:
         exp_name: file name without suffix.
@@ -57,6 +60,7 @@ class MCAPLogger(Logger):
         if self.path.exists() and not overwrite:
             raise FileExistsError(f"{self.path} exists: pass overwrite=True or choose another exp_name")
         self._channels: dict[str, Any] = {}
+        self._timer: threading.Timer | None = None
         super().__init__(exp_name=exp_name, log_dir=str(log_dir))
 
     def _create_experiment(self) -> foxglove.MCAPWriter:
@@ -73,6 +77,21 @@ class MCAPLogger(Logger):
             schema = Schema(name=_SCALAR.name, encoding="protobuf", data=_SCALAR.schema())
             self._channels[topic] = Channel(topic, schema=schema, message_encoding="protobuf", context=self._context)
         self._channels[topic].log(message, log_time=time.time_ns())
+        self._flush_soon()
+
+    def _flush_soon(self) -> None:
+        """Flushes half a second from now, so that a kill loses less than a second and a burst costs one flush."""
+        if self._timer is None or not self._timer.is_alive():
+            self._timer = threading.Timer(_FLUSH_SECONDS, self.flush)
+            self._timer.daemon = True
+            self._timer.start()
+
+    def shutdown(self, timeout: float | None = None) -> None:
+        """Completes the file."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer.join()
+        super().shutdown(timeout)
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, *, fps: float = 20.0, **_: Any) -> None:
         """Frames uint8 [T, 3, H, W], or several videos [N, T, 3, H, W], one after another; 20 a second by default.
@@ -99,6 +118,7 @@ class MCAPLogger(Logger):
                 data=frame.tobytes(),
             )
             self._channels[topic].log(message, log_time=at)
+        self._flush_soon()
 
     def log_hparams(self, cfg: Any) -> None:
         """A dictionary or dataclass of settings, as metadata of the file."""
@@ -119,6 +139,7 @@ class MCAPLogger(Logger):
             self._channels[topic] = Channel(topic, message_encoding="json", schema=_HISTOGRAM, context=self._context)
         message = {"counts": counts.tolist(), "edges": edges.tolist(), "step": _NO_STEP if step is None else step}
         self._channels[topic].log(json.dumps(message).encode(), log_time=time.time_ns())
+        self._flush_soon()
 
     def log_str(self, name: str, value: str, step: int | None = None) -> None:
         """A line of text on the ``/log`` topic."""
@@ -128,6 +149,7 @@ class MCAPLogger(Logger):
         text = value if step is None else f"step {step}: {value}"
         stamp = Timestamp(*divmod(now, 1_000_000_000))
         self._channels["/log"].log(Log(timestamp=stamp, level=LogLevel.Info, message=text, name=name), log_time=now)
+        self._flush_soon()
 
     def __repr__(self) -> str:
         return f"MCAPLogger(exp_name={self.exp_name!r}, path={str(self.path)!r})"

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
 
-__all__ = ["FixedMessage", "MessageField", "image_data"]
+__all__ = ["FixedMessage", "MessageField", "image_data", "varint"]
 
 _DOUBLE, _FLOAT, _BOOL, _STRING, _MESSAGE, _BYTES, _SFIXED32, _SFIXED64 = 1, 2, 8, 9, 11, 12, 15, 16
 _TYPES = {
@@ -60,12 +61,15 @@ class FixedMessage:
 
     def pack(self, values: list[np.ndarray]) -> list[bytes]:
         """Messages from the fields' raw bytes, uint8 [n, nbytes of the field] each."""
-        count = len(values[0])
-        packed = np.broadcast_to(self._template, (count, self.nbytes)).copy()
-        for place, value in zip(self._places, values, strict=True):
-            packed[:, place] = value
-        joined = packed.tobytes()
+        joined = self.fill(np.empty((len(values[0]), self.nbytes), np.uint8), values).tobytes()
         return [joined[start : start + self.nbytes] for start in range(0, len(joined), self.nbytes)]
+
+    def fill(self, messages: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
+        """Writes messages uint8 [n, nbytes] in place, from the fields' raw bytes, and returns them."""
+        messages[:] = self._template
+        for place, value in zip(self._places, values, strict=True):
+            messages[:, place] = value
+        return messages
 
     def unpack(self, messages: list[bytes]) -> list[np.ndarray]:
         """The fields' raw bytes, uint8 [n, nbytes of the field] each.
@@ -143,11 +147,13 @@ def _kind(field: MessageField) -> tuple[int, bool]:
 def _header(number: int, field: MessageField) -> bytes:
     kind, repeated = _kind(field)
     if repeated or kind == _BYTES:
-        return _varint(number << 3 | _LENGTH_DELIMITED) + _varint(field.nbytes)
-    return _varint(number << 3 | _WIRE[kind])
+        return varint(number << 3 | _LENGTH_DELIMITED) + varint(field.nbytes)
+    return varint(number << 3 | _WIRE[kind])
 
 
-def _varint(value: int) -> bytes:
+@lru_cache(65536)
+def varint(value: int) -> bytes:
+    """A protobuf varint."""
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -168,8 +174,8 @@ def _read_varint(message: bytes, position: int) -> tuple[int, int]:
 
 
 def _bytes_field(number: int, value: bytes) -> bytes:
-    return _varint(number << 3 | _LENGTH_DELIMITED) + _varint(len(value)) + value
+    return varint(number << 3 | _LENGTH_DELIMITED) + varint(len(value)) + value
 
 
 def _varint_field(number: int, value: int) -> bytes:
-    return _varint(number << 3) + _varint(value)
+    return varint(number << 3) + varint(value)

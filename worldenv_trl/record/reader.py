@@ -3,78 +3,172 @@
 from __future__ import annotations
 
 import glob
-import json
 import os
 import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from mcap.records import Attachment, Channel, Message, Metadata
 from tensordict import NonTensorData, NonTensorStack, TensorDict
 from torch import Tensor
 
-from worldenv_trl.keys import MASK, TASK_ID
-from worldenv_trl.record.layout import Layout
+from worldenv_trl.keys import EPISODE, MASK, ROW, TASK_ID
+from worldenv_trl.record.mcap_file import PARTIAL_SUFFIX
 from worldenv_trl.record.part import Part
-from worldenv_trl.record.scan import Truncated, scan
-from worldenv_trl.record.writer import FORMAT, PARTIAL_SUFFIX, VERSION
+from worldenv_trl.record.recording import TEXT, Recording, RolloutInfo
 
-__all__ = ["read_attachments", "read_metadata", "read_rollouts"]
+__all__ = ["list_rollouts", "read_attachments", "read_metadata", "read_rollouts"]
 
 _Path = tuple[str, ...]
+_Key = str | tuple[str, ...]
 
 
-def read_rollouts(path: str | os.PathLike, *, task: str | None = None) -> TensorDict:
-    """The rollouts that :class:`RolloutWriter` wrote to a file, to all files of a folder or to those of a glob.
+def read_rollouts(
+    path: str | os.PathLike,
+    *,
+    task: str | None = None,
+    rollouts: int | slice | Sequence[int] | None = None,
+    time: tuple[float, float] | None = None,
+    steps: slice | None = None,
+    keys: Sequence[_Key] | None = None,
+) -> TensorDict:
+    """The rollouts that were recorded into a file, all files of a folder or those of a glob.
 
     Keys, dtypes and the values where ``("collector", "mask")`` is True are those that were written, bit for bit; the
     rest is zero. Several writes or files are concatenated along the first dimension and padded to the longest (batch
     dimensions are flattened where they differ behind the first). Where no rollout is shorter than the others, root and
     next values that were stored once share memory: clone them before writing in place.
 
-    A file that was cut off gives every step that is complete, with a warning. Files of a folder that are still being
-    written (``*.partial.mcap``) are left out.
+    A file that was cut off or damaged gives, with a warning, of every rollout the steps before the first one that is
+    lost. Files of a folder that are still being written (``*.partial.mcap``) are left out.
 
     Args:
         path: file, folder (its ``*.mcap``, by name) or pattern.
 
     Keyword Args:
         task: only rollouts of this task.
+        rollouts: only these, counted through all files.
+        time: only rollouts that play between these seconds of their file, as a viewer's time line shows them.
+        steps: only this part of each rollout.
+        keys: only these entries, named as in the TensorDict; the others are not decoded.
 
     Returns:
-        TensorDict [*B, T].
+        TensorDict [*B, T]; [R, T] when rollouts are chosen.
 
     Raises:
         FileNotFoundError: if there is no such file, or none in the folder.
-        ValueError: for a file that is no MCAP, damaged or not written by :class:`RolloutWriter`; for files whose
-            entries differ; if ``task`` is not in the files.
+        ValueError: for a file that is no MCAP, without messages that it should hold, or not written by this package
+            or by a later release of it; for files whose entries differ; if ``task``, a rollout or a key is not in them.
     """
-    files = _files(path)
+    recordings = [Recording(file) for file in _files(path)]
+    if task is not None:
+        for recording in recordings:
+            _require_task(recording.path, recording.metadata, task)
+    several = task is not None and (len(recordings) > 1 or len(_tasks(recordings[0].metadata)) > 1)
+    wanted = _wanted(keys, several)
+    chosen = _chosen(recordings, rollouts, path)
     parts: list[Part] = []
-    metadata: dict[str, Any] = {}
-    for file in files:
-        found, described = _read_file(file)
-        if task is not None:
-            _require_task(file, described, task)
-        parts += found
-        metadata = described
+    for number, recording in enumerate(recordings):
+        keep = _keep(None if chosen is None else chosen[number], time)
+        if chosen is None or chosen[number]:
+            parts += _read(recording, keep, wanted)
     if not parts:
-        raise ValueError(f"{path} holds no rollouts")
-    rollouts = _join(parts, path)
-    if task is None or (len(_tasks(metadata)) == 1 and len(files) == 1):
-        return rollouts
-    return _of_task(rollouts, task, path)
+        lost = [recording.warning(0, 0) for recording in recordings if not recording.scan.intact]
+        asked = "" if rollouts is time is None else " that were asked for"
+        raise ValueError(f"{path} holds no rollouts{asked}{': ' + lost[0] if lost else ''}")
+    out = _join(parts, path)
+    out = _of_task(out, task, path) if several else out
+    if steps is not None:
+        out = out[..., steps]
+    return out if keys is None else _selected(out, keys, path)
+
+
+def list_rollouts(path: str | os.PathLike) -> list[RolloutInfo]:
+    """What each rollout is: file, number, time, entries, instruction, row. Frames are not decoded.
+
+    Raises and warns as :func:`read_rollouts`.
+    """
+    infos: list[RolloutInfo] = []
+    for recording in map(Recording, _files(path)):
+        infos += recording.infos(_read(recording, None, lambda key: key in ((ROW,), (EPISODE,))))
+    return infos
 
 
 def read_metadata(path: str | os.PathLike) -> dict[str, Any]:
-    """The ``metadata`` that a file's :class:`RolloutWriter` was given. Raises as :func:`read_rollouts`."""
-    return _described(_require_file(path))[0]
+    """The ``metadata`` that a file was recorded with. Raises as :func:`read_rollouts`."""
+    return Recording(_require_file(path)).metadata
 
 
 def read_attachments(path: str | os.PathLike) -> dict[str, bytes]:
     """The attachments of a file, by name. Raises as :func:`read_rollouts`."""
-    return _described(_require_file(path))[1]
+    return {each.name: each.data for each in Recording(_require_file(path)).scan.attachments}
+
+
+# ------------------------------------------------------------------------------------------------- selecting
+
+
+def _read(recording: Recording, keep: Callable | None, wanted: Callable[[_Path], bool]) -> list[Part]:
+    expected = [
+        sum(length for i, length in enumerate(part.lengths) if keep is None or keep(part.numbers[i], 0, 2**62))
+        for part in recording.written
+    ]
+    parts = recording.parts(keep, wanted)
+    if not parts:
+        return []
+    said = recording.warning(sum(part.done for part in parts), sum(expected))
+    if said:
+        warnings.warn(said, stacklevel=4)
+    return parts
+
+
+def _wanted(keys: Sequence[_Key] | None, several: bool) -> Callable[[_Path], bool]:
+    if keys is None:
+        return lambda _: True
+    paths = {_path(key)[1:] if _path(key)[0] == "next" else _path(key) for key in keys}
+    return lambda path: path in paths or (several and path == (TASK_ID,))
+
+
+def _path(key: _Key) -> _Path:
+    return (key,) if isinstance(key, str) else tuple(key)
+
+
+def _chosen(recordings: list[Recording], rollouts: int | slice | Sequence[int] | None, path) -> list[set[int]] | None:
+    """The numbers of the chosen rollouts within each file."""
+    if rollouts is None:
+        return None
+    counts = [recording.count() for recording in recordings]
+    if isinstance(rollouts, slice):
+        numbers = list(range(*rollouts.indices(sum(counts))))
+    else:
+        numbers = [rollouts] if isinstance(rollouts, int) else list(rollouts)
+    beyond = [number for number in numbers if not 0 <= number < sum(counts)]
+    if beyond:
+        raise ValueError(f"{path} holds the rollouts 0 to {sum(counts) - 1}, not {beyond[0]}")
+    firsts = [sum(counts[:i]) for i in range(len(counts))]
+    return [
+        {number - first for number in numbers if first <= number < first + count}
+        for first, count in zip(firsts, counts, strict=True)
+    ]
+
+
+def _keep(numbers: set[int] | None, time: tuple[float, float] | None) -> Callable[[int, int, int], bool] | None:
+    if numbers is None and time is None:
+        return None
+    first, last = (-1.0, float("inf")) if time is None else time
+
+    def keep(number: int, start: int, end: int) -> bool:
+        return (numbers is None or number in numbers) and start <= last * 1e9 and end >= first * 1e9
+
+    return keep
+
+
+def _selected(rollouts: TensorDict, keys: Sequence[_Key], path: str | os.PathLike) -> TensorDict:
+    have = set(rollouts.keys(True, True))
+    missing = [key for key in keys if (_path(key)[0] if len(_path(key)) == 1 else _path(key)) not in have]
+    if missing:
+        raise ValueError(f"{path} holds no entry {missing[0]}: it has {', '.join(sorted(map(str, have)))}")
+    return rollouts.select(*keys, MASK)
 
 
 # ------------------------------------------------------------------------------------------------- files
@@ -106,108 +200,6 @@ def _require_file(path: str | os.PathLike) -> Path:
     raise FileNotFoundError(f"there is no file {path}{hint}")
 
 
-def _read_file(path: Path) -> tuple[list[Part], dict[str, Any]]:
-    """The writes of a file and its metadata; warns if it was cut off."""
-    layouts: list[Layout] = []
-    parts: list[Part] = []
-    metadata: dict[str, Any] = {}
-    topics: dict[int, str] = {}
-    known = truncated = False
-    try:
-        for record in scan(path):
-            if isinstance(record, Message):
-                if parts:
-                    topic = topics.get(record.channel_id, "")
-                    parts[-1].messages.setdefault(topic, []).append(record.data)
-            elif isinstance(record, Channel):
-                topics[record.id] = record.topic
-            elif isinstance(record, Metadata) and record.name == FORMAT:
-                known = True
-                _check_version(path, record.metadata)
-            elif isinstance(record, Metadata) and record.name == "metadata":
-                metadata = _plain(path, record.metadata)
-            elif isinstance(record, Metadata) and record.name == f"{FORMAT}.layout":
-                layouts.append(_described_layout(path, record.metadata))
-            elif isinstance(record, Metadata) and record.name == f"{FORMAT}.write":
-                if parts:
-                    parts[-1].decode(complete=True)
-                parts.append(_described_write(path, record.metadata, layouts))
-    except Truncated:
-        truncated = True
-    if not known:
-        raise ValueError(f"{path} holds no worldenv_trl rollouts: it was written by another program")
-    if parts:
-        expected = sum(parts[-1].lengths)
-        parts[-1].decode(complete=not truncated)
-        if truncated:
-            done = sum(part.done for part in parts)
-            missing = expected - parts[-1].done
-            warnings.warn(
-                f"{path} is truncated: {done} complete steps were read, at least {missing} more are missing",
-                stacklevel=3,
-            )
-    return [part for part in parts if part.rows], metadata
-
-
-def _described(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
-    metadata, attachments, known = {}, {}, False
-    try:
-        for record in scan(path):
-            if isinstance(record, Metadata) and record.name == FORMAT:
-                known = True
-            elif isinstance(record, Metadata) and record.name == "metadata":
-                metadata = _plain(path, record.metadata)
-            elif isinstance(record, Attachment):
-                attachments[record.name] = record.data
-            elif isinstance(record, Channel | Message):
-                break  # both come before the first message
-    except Truncated:
-        pass
-    if not known:
-        raise ValueError(f"{path} holds no worldenv_trl rollouts: it was written by another program")
-    return metadata, attachments
-
-
-def _check_version(path: Path, values: dict[str, str]) -> None:
-    version = int(values.get("version", "0"))
-    if not 1 <= version <= VERSION:
-        raise ValueError(
-            f"{path} has format version {version}, this release reads up to {VERSION}: update worldenv_trl"
-        )
-
-
-def _plain(path: Path, values: dict[str, str]) -> dict[str, Any]:
-    try:
-        return {key: json.loads(value) for key, value in values.items()}
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path} holds no worldenv_trl rollouts: its metadata is not JSON ({error})") from error
-
-
-def _described_layout(path: Path, values: dict[str, str]) -> Layout:
-    try:
-        return Layout.from_json(json.loads(values["json"]))
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} describes its entries in a way this release does not know: {error!r}") from error
-
-
-def _described_write(path: Path, values: dict[str, str], layouts: list[Layout]) -> Part:
-    try:
-        record = json.loads(values["json"])
-        index = record["layout"]
-        return Part(
-            layout=layouts[index],
-            prefix=f"/layout_{index + 1}" if index else "",
-            batch=record["batch"],
-            steps=record["steps"],
-            lengths=record["lengths"],
-            texts=[(tuple(key), words) for key, words in record["texts"]],
-            executed=record.get("executed"),
-            file=path,
-        )
-    except (json.JSONDecodeError, KeyError, IndexError, TypeError) as error:
-        raise ValueError(f"{path} describes its rollouts in a way this release does not know: {error!r}") from error
-
-
 # ------------------------------------------------------------------------------------------------- joining
 
 
@@ -227,6 +219,8 @@ def _join(parts: list[Part], path: str | os.PathLike) -> TensorDict:
                 f"({sorted(map(str, have ^ names[0]))}): read them one by one"
             )
     for key in list(expanded[0]):
+        if key == ("root", TEXT):
+            continue
         values = [each.pop(key) for each in expanded]
         if len({(value.dtype, value.shape[2:]) for value in values}) > 1:
             shapes = sorted({str((value.dtype, *value.shape[2:])) for value in values})

@@ -1,104 +1,217 @@
-"""Records of an MCAP file in their order, as far as the file goes."""
+"""What an MCAP file holds, as far as it goes: also when its end is missing or some of its bytes were changed."""
 
 from __future__ import annotations
 
 import io
+import mmap
 import struct
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import InvalidMagic, McapError
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, McapRecord, Message, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.records import Attachment, Channel, ChunkIndex, Metadata, Schema
 
-__all__ = ["Truncated", "scan"]
+__all__ = ["Chunk", "McapScan", "Message"]
+
+_MAGIC = b"\x89MCAP0\r\n"
+_FOOTER = struct.Struct("<BQQQI")
+_HEAD = struct.Struct("<BQ")
+_CHUNK = struct.Struct("<QQQII")
+_MESSAGE = struct.Struct("<HIQQ")
+_TRUNCATED = "is truncated"
+
+Message = tuple[int, int, int, memoryview]  # channel, sequence, log time (ns), data
 
 
-class Truncated(Exception):
-    """The file ends before it is complete; every record up to there was delivered."""
+@dataclass(frozen=True)
+class Chunk:
+    """A compressed run of messages: their times (ns) and where it lies in the file."""
+
+    start_time: int
+    end_time: int
+    position: int
+    compression: str
+    size: int
+    crc: int
+    data: slice
+    complete: bool
 
 
-def scan(path: Path) -> Iterator[McapRecord]:
-    """Yields records; chunks are opened, the readable part of an unfinished one included.
+class McapScan:
+    """The records of a file in their order, without its messages, which :meth:`messages` opens chunk by chunk.
+
+    ``losses`` says, one line each, what is missing; it grows while damaged chunks are opened. Records behind a damaged
+    one are found again by the file's index.
 
     Raises:
-        ValueError: if the file is no MCAP, or bytes in it were changed.
-        Truncated: at the end of a file that was cut off or never closed.
+        ValueError: if the file is no MCAP.
     """
-    size = path.stat().st_size
-    with open(path, "rb") as file:
-        records = StreamReader(file, emit_chunks=True, record_size_limit=max(size, 1)).records
-        start = 8  # where the record that is being read begins, behind the magic
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.metadata: list[Metadata] = []
+        self.attachments: list[Attachment] = []
+        self.channels: dict[int, Channel] = {}
+        self.schemas: dict[int, Schema] = {}
+        self.chunks: list[Chunk] = []
+        self.losses: list[str] = []
+        size = path.stat().st_size
+        if size < 8:
+            raise ValueError(f"{path} is not an MCAP file: it has {size} bytes")
+        with open(path, "rb") as file:
+            self._bytes = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        if self._bytes[:8] != _MAGIC:
+            raise ValueError(f"{path} is not an MCAP file")
+        self._walk()
+
+    @property
+    def truncated(self) -> bool:
+        return _TRUNCATED in self.losses
+
+    @property
+    def intact(self) -> bool:
+        return not self.losses
+
+    def _walk(self) -> None:
+        data, size = self._bytes, len(self._bytes)
+        position = 8
+        while position + 9 <= size:
+            opcode, length = _HEAD.unpack_from(data, position)
+            body = position + 9
+            if opcode == Opcode.FOOTER and body + length + 8 == size:
+                if data[-8:] != _MAGIC:
+                    self.losses.append("is damaged at its end")
+                return
+            whole = body + length <= size
+            known = Opcode.HEADER <= opcode <= Opcode.DATA_END
+            if known and whole and self._record(opcode, position, body, length):
+                position = body + length
+                continue
+            later = [place for place in self._indexed() if place > position]
+            if later:
+                self.losses.append(f"is damaged between byte {position} and byte {later[0]}")
+                position = later[0]
+                continue
+            if opcode == Opcode.CHUNK and not whole:
+                self._unfinished(position, body)
+            self.losses.append(_TRUNCATED if not whole else f"is damaged behind byte {position}")
+            return
+        self.losses.append(_TRUNCATED)
+
+    def _record(self, opcode: int, position: int, body: int, length: int) -> bool:
+        """Notes a record; False if it makes no sense."""
         try:
-            while (record := next(records, None)) is not None:
-                if isinstance(record, Chunk):
-                    yield from breakup_chunk(record, validate_crc=True)
+            if opcode == Opcode.CHUNK:
+                start, end, size, crc, name = _CHUNK.unpack_from(self._bytes, body)
+                first = body + _CHUNK.size + name + 8
+                compression = self._bytes[body + _CHUNK.size : first - 8].decode()
+                self.chunks.append(
+                    Chunk(start, end, position, compression, size, crc, slice(first, body + length), complete=True)
+                )
+            elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT, Opcode.CHANNEL, Opcode.SCHEMA):
+                stream = ReadDataStream(io.BytesIO(self._bytes[body : body + length]))
+                if opcode == Opcode.METADATA:
+                    self.metadata.append(Metadata.read(stream))
+                elif opcode == Opcode.CHANNEL:
+                    channel = Channel.read(stream)
+                    self.channels[channel.id] = channel
+                elif opcode == Opcode.SCHEMA:
+                    schema = Schema.read(stream)
+                    self.schemas[schema.id] = schema
                 else:
-                    yield record
-                start = file.tell()
-            return
-        except InvalidMagic as error:
-            if start > 8:
-                raise ValueError(f"{path} is damaged at its end. Restore it from a copy") from error
-            raise ValueError(f"{path} is not an MCAP file") from error
-        except (CRCValidationError, McapError, zstandard.ZstdError, struct.error, UnicodeDecodeError) as error:
-            if size < 8:
-                raise ValueError(f"{path} is not an MCAP file: it has {size} bytes") from error
-            if not _reaches_past(file, start, size):
-                raise ValueError(f"{path} is damaged behind byte {start}: {error}. Restore it from a copy") from error
-        yield from _unfinished_chunk(file, start)
-    raise Truncated(str(path))
-
-
-def _reaches_past(file: io.BufferedReader, start: int, size: int) -> bool:
-    """Whether the record at ``start`` ends behind the file, as the last one of an interrupted recording does."""
-    file.seek(start)
-    head = file.read(9)
-    if len(head) < 9:
+                    self._attachment(stream, body, length)
+        except (struct.error, ValueError, McapError, IndexError, MemoryError, OverflowError):
+            return False
         return True
-    opcode, length = struct.unpack("<BQ", head)
-    return start + 9 + length + (8 if opcode == Opcode.FOOTER else 0) > size
 
-
-def _unfinished_chunk(file: io.BufferedReader, start: int) -> Iterator[McapRecord]:
-    """The complete records of a chunk whose end is missing, if that is what begins at ``start``."""
-    file.seek(start)
-    head = file.read(9 + 8 + 8 + 8 + 4 + 4)  # opcode, length; times, size, CRC, length of the compression's name
-    if len(head) < 41 or head[0] != Opcode.CHUNK:
-        return
-    (name_length,) = struct.unpack("<I", head[37:41])
-    name = file.read(name_length)
-    data = file.read()[8:]
-    if name == b"zstd":
-        data = _decompressed(data)
-    elif name:
-        return
-    stream = ReadDataStream(io.BytesIO(data))
-    while stream.count + 9 <= len(data):
-        opcode, length = stream.read1(), stream.read8()
-        if stream.count + length > len(data):
-            return
-        if opcode == Opcode.MESSAGE:
-            yield Message.read(stream, length)
-        elif opcode == Opcode.CHANNEL:
-            yield Channel.read(stream)
-        elif opcode == Opcode.SCHEMA:
-            yield Schema.read(stream)
+    def _attachment(self, stream: ReadDataStream, body: int, length: int) -> None:
+        attachment = Attachment.read(stream)
+        (crc,) = struct.unpack_from("<I", self._bytes, body + length - 4)
+        if crc and zlib.crc32(self._bytes[body : body + length - 4]) != crc:
+            self.losses.append(f"has a damaged attachment {attachment.name!r}")
         else:
-            stream.read(length)
+            self.attachments.append(attachment)
+
+    def _indexed(self) -> list[int]:
+        """Where chunks begin and what follows the last one, by the index at the end of the file, if it is there."""
+        data, size = self._bytes, len(self._bytes)
+        if size < 45 or data[-8:] != _MAGIC:
+            return []
+        opcode, length, summary, offsets, _ = _FOOTER.unpack_from(data, size - 8 - _FOOTER.size)
+        if opcode != Opcode.FOOTER or length != 20 or not 8 < summary < size:
+            return []
+        places, position, end = [summary], summary, offsets or size - 8 - _FOOTER.size
+        while position + 9 <= end:
+            opcode, length = _HEAD.unpack_from(data, position)
+            if opcode == Opcode.CHUNK_INDEX:
+                index = ChunkIndex.read(ReadDataStream(io.BytesIO(data[position + 9 : position + 9 + length])))
+                places += [index.chunk_start_offset, index.chunk_start_offset + index.chunk_length]
+            position += 9 + length
+        return sorted(places)
+
+    def _unfinished(self, position: int, body: int) -> None:
+        """A chunk whose end is missing."""
+        if body + _CHUNK.size > len(self._bytes):
+            return
+        start, end, size, crc, name = _CHUNK.unpack_from(self._bytes, body)
+        first = body + _CHUNK.size + name + 8
+        if name > 16 or first > len(self._bytes):
+            return
+        compression = self._bytes[body + _CHUNK.size : first - 8].decode(errors="replace")
+        data = slice(first, len(self._bytes))
+        self.chunks.append(Chunk(start, end, position, compression, size, crc, data, complete=False))
+
+    # --------------------------------------------------------------------------------------------- messages
+
+    def messages(self, chunk: Chunk) -> Iterator[Message]:
+        """The messages of a chunk; of a damaged one none, of one whose end is missing those that are complete."""
+        data = self._opened(chunk)
+        view, position, size = memoryview(data), 0, len(data)
+        while position + 9 <= size:
+            opcode, length = _HEAD.unpack_from(data, position)
+            body, end = position + 9, position + 9 + length
+            if end > size:
+                return
+            if opcode == Opcode.MESSAGE:
+                channel, sequence, time, _ = _MESSAGE.unpack_from(data, body)
+                yield channel, sequence, time, view[body + _MESSAGE.size : end]
+            elif opcode == Opcode.CHANNEL:
+                record = Channel.read(ReadDataStream(io.BytesIO(data[body:end])))
+                self.channels[record.id] = record
+            elif opcode == Opcode.SCHEMA:
+                schema = Schema.read(ReadDataStream(io.BytesIO(data[body:end])))
+                self.schemas[schema.id] = schema
+            position = end
+
+    def _opened(self, chunk: Chunk) -> bytes:
+        packed = self._bytes[chunk.data]
+        if not chunk.complete:
+            return _prefix(packed) if chunk.compression == "zstd" else packed if not chunk.compression else b""
+        try:
+            if chunk.compression not in ("", "zstd"):
+                raise ValueError(f"compression {chunk.compression!r} is not supported")
+            zstd = zstandard.ZstdDecompressor()
+            data = zstd.decompress(packed, max_output_size=chunk.size) if chunk.compression else packed
+            if len(data) != chunk.size or (chunk.crc and zlib.crc32(data) != chunk.crc):
+                raise ValueError("its checksum differs")
+        except (zstandard.ZstdError, ValueError, MemoryError) as error:
+            self.losses.append(f"is damaged behind byte {chunk.position} ({chunk.size} bytes of messages: {error})")
+            return b""
+        return data
 
 
-def _decompressed(data: bytes) -> bytes:
+def _prefix(data: bytes) -> bytes:
     """What a zstd stream without its end still gives."""
     decompressor = zstandard.ZstdDecompressor().decompressobj()
     out = bytearray()
     try:
         for start in range(0, len(data), 4096):
             out += decompressor.decompress(data[start : start + 4096])
-    except (zstandard.ZstdError, zlib.error):
+    except zstandard.ZstdError:
         pass
     return bytes(out)

@@ -1,35 +1,56 @@
-"""Rollouts to MCAP."""
+"""Finished rollouts to MCAP."""
 
 from __future__ import annotations
 
-import errno
 import json
 import os
-import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-import foxglove
 import numpy as np
-import torch
-from foxglove import Channel, Context, Schema
-from foxglove.channels import LogChannel, PoseInFrameChannel, RawImageChannel
-from foxglove.mcap import MCAPWriteOptions
-from foxglove.messages import Log, LogLevel, Pose, PoseInFrame, Quaternion, RawImage, Timestamp, Vector3
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from worldenv_trl.keys import CONTROL_HZ, FRAMES, INSTRUCTION, STATE, STEP_MASK, SUCCESS
-from worldenv_trl.record.layout import Layout, executed_entries, leaves, to_bytes
+from worldenv_trl.keys import INSTRUCTION, STEP_MASK, SUCCESS
+from worldenv_trl.record.annotations import Annotator
+from worldenv_trl.record.encoder import PERIOD_NS, RolloutEncoder
+from worldenv_trl.record.layout import Layout, executed_entries, leaves
+from worldenv_trl.record.mcap_file import McapFile
 
-__all__ = ["FORMAT", "PARTIAL_SUFFIX", "VERSION", "RolloutWriter"]
+__all__ = ["FORMAT", "VERSION", "RolloutWriter", "open_file"]
 
-FORMAT, VERSION = "worldenv_trl.rollouts", 1
-PARTIAL_SUFFIX = ".partial.mcap"
-_PERIOD_NS = 1_000_000_000 // CONTROL_HZ
-_CHUNK_BYTES = 4 * 2**20  # most of a frame repeats its predecessor: larger chunks halve the file
+FORMAT, VERSION = "worldenv_trl.rollouts", 2
 _FIRST_GUESS = 0.5  # compressed size over raw size, before anything was measured
+_MEASURED = 16 * 2**20  # bytes
+_STEPS_AT_ONCE = 8  # of a file that is cut off, so many may be lost
+
+
+def open_file(
+    path: str | os.PathLike,
+    metadata: Mapping[str, Any] | None,
+    attachments: Mapping[str, bytes | str | os.PathLike] | None,
+    overwrite: bool,
+) -> McapFile:
+    """A file of this format that holds its metadata and attachments already; raises as :class:`RolloutWriter`."""
+    try:
+        described = {str(key): json.dumps(value) for key, value in (metadata or {}).items()}
+    except TypeError as error:
+        raise ValueError(f"metadata must hold plain values (text, numbers, lists, dicts): {error}") from error
+    files = {name: _contents(name, value) for name, value in (attachments or {}).items()}
+    file = McapFile(path, overwrite=overwrite)
+    try:
+        file.require_space(sum(map(len, files.values())))
+        file.write_metadata(FORMAT, {"version": str(VERSION)})
+        if described:
+            file.write_metadata("metadata", described)
+        for name, data in files.items():
+            file.attach(name, data)
+        file.flush()
+    except OSError:
+        file.abort()
+        raise
+    return file
 
 
 class RolloutWriter:
@@ -41,20 +62,24 @@ class RolloutWriter:
     needed to rebuild the TensorDict is metadata written before the messages.
 
     The file appears under its name when the writer is closed. Until then, and after an exception, what was written is
-    in ``<name>.partial.mcap``, which :func:`read_rollouts` opens when named.
+    in ``<name>.partial.mcap``, which :func:`read_rollouts` opens when named. What :meth:`write` has written when it
+    returns survives the death of the process.
 
     Args:
         path: ends in ``.mcap``; folders are created.
 
     Keyword Args:
         metadata: plain values (strings, numbers, lists, dicts), for instance ``{"tasks": [...], "seed": 0}``. ``task``
-            or ``tasks`` names the tasks for ``read_rollouts(path, task=...)``.
+            or ``tasks`` names the tasks for ``read_rollouts(path, task=...)``. :func:`~worldenv_trl.record.provenance`
+            makes metadata and attachments of env, models, settings and versions.
         attachments: name -> bytes, text or the path of a file.
-        overwrite: replace an existing file.
+        overwrite: replace an existing file, or an unfinished one of that name.
 
     Raises:
-        FileExistsError: if the file exists and ``overwrite`` is False.
+        FileExistsError: if the file, or an unfinished one of that name, exists and ``overwrite`` is False; if another
+            writer is at work on it.
         ValueError: for another suffix, or metadata that is not plain.
+        OSError: if the disk is full, from any method; the partial file keeps what is complete.
 
     Examples:
         >>> with RolloutWriter("runs/demo.mcap", metadata={"task": "starter/open_the_top_drawer"}) as writer:
@@ -70,46 +95,28 @@ class RolloutWriter:
         overwrite: bool = False,
     ) -> None:
         self.path = Path(path)
-        if self.path.suffix != ".mcap" or self.path.name.endswith(PARTIAL_SUFFIX):
-            raise ValueError(f"path must end in .mcap (not {PARTIAL_SUFFIX}), got {self.path}")
-        if self.path.exists() and not overwrite:
-            raise FileExistsError(f"{self.path} exists: pass overwrite=True to replace it")
-        try:
-            described = {str(key): json.dumps(value) for key, value in (metadata or {}).items()}
-        except TypeError as error:
-            raise ValueError(f"metadata must hold plain values (text, numbers, lists, dicts): {error}") from error
-        files = {name: _contents(name, value) for name, value in (attachments or {}).items()}
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._partial = self.path.with_name(self.path.stem + PARTIAL_SUFFIX)
-        _require_space(self.path, sum(map(len, files.values())) + 65536)
-        self._context = Context()
-        options = MCAPWriteOptions(chunk_size=_CHUNK_BYTES, compression_threads=0, profile="")
-        self._file = foxglove.open_mcap(
-            self._partial, allow_overwrite=True, context=self._context, writer_options=options
-        )
-        self._file.write_metadata(FORMAT, {"version": str(VERSION)})
-        if described:
-            self._file.write_metadata("metadata", described)
-        for name, data in files.items():
-            self._file.attach(log_time=0, create_time=0, name=name, media_type="application/octet-stream", data=data)
-        self._layouts: list[Layout] = []
-        self._channels: dict[str, Any] = {}
-        self._closed = False
+        self._file = open_file(path, metadata, attachments, overwrite)
+        self._encoders: list[RolloutEncoder] = []
         self._raw_bytes = 0
-        self._rollouts = 0
+        self._starts: list[tuple[int, int, int]] = []  # of each rollout: time (ns), its layout, its entries
         self._time = 0
+        self._annotator = Annotator(self._file, f"{FORMAT}.annotation", self._length, self._step_time)
+        self._writing = False  # half of a write must not look complete
 
-    def write(self, rollouts: TensorDictBase) -> None:
+    def write(self, rollouts: TensorDictBase) -> list[int]:
         """Appends rollouts ``[*B, T]`` with their root and next entries; one action or one decision per entry.
 
         Only what ``("collector", "mask")`` marks is stored (without a mask: up to the first ``done``). Text must be
         constant within a rollout. Writes may differ in B and T.
 
+        Returns:
+            The numbers of these rollouts in the file, for :meth:`annotate`.
+
         Raises:
             ValueError: for a writer that is closed, or entries that are neither tensors nor text.
             OSError: before anything of ``rollouts`` is written, if the disk seems too small for it.
         """
-        if self._closed:
+        if self._file.closed:
             raise ValueError(f"the writer of {self.path} is closed")
         if rollouts.ndim < 1 or 0 in rollouts.shape:
             raise ValueError(f"rollouts must be [*B, T] with at least one entry, got {list(rollouts.shape)}")
@@ -120,121 +127,90 @@ class RolloutWriter:
         lengths = valid.sum(-1)
         texts = {path: _row_texts(path, value, valid.shape, lengths) for path, value in texts.items()}
         raw = sum(int(lengths.sum()) * e.nbytes for e in (*layout.images, *layout.numbers))
-        _require_space(self.path, int(raw * self._compression()) + 65536)
+        self._file.require_space(int(raw * self._compression()))
 
-        if layout not in self._layouts:
-            self._layouts.append(layout)
-            self._file.write_metadata(f"{FORMAT}.layout", {"json": json.dumps(layout.to_json())})
-        index = self._layouts.index(layout)
+        index = self._layout_index(layout)
+        first = len(self._starts)
         record = {
             "layout": index,
             "batch": list(rollouts.shape[:-1]),
             "steps": rollouts.shape[-1],
             "lengths": lengths.tolist(),
             "texts": [[list(path), texts[path]] for path in layout.texts],
+            "first": first,
         }
         if layout.splits_frames:
             executed = flat["next", STEP_MASK].sum(-1)
             record["executed"] = [executed[row, :length].tolist() for row, length in enumerate(lengths.tolist())]
+        self._writing = True
         self._file.write_metadata(f"{FORMAT}.write", {"json": json.dumps(record)})
-        prefix = f"/layout_{index + 1}" if index else ""
+        said = texts.get((INSTRUCTION,)) or texts.get(("next", INSTRUCTION))
         for row, length in enumerate(lengths.tolist()):
-            self._write_row(layout, prefix, {key: value[row, : max(length, 1)] for key, value in flat.items()}, length)
-            said = texts.get((INSTRUCTION,)) or texts.get(("next", INSTRUCTION))
+            self._write_row(index, {key: value[row] for key, value in flat.items()}, length)
             if said:
-                self._say(said[row], flat, row, length)
-            self._rollouts += 1
+                self._encoders[index].say(first + row, self._time - PERIOD_NS, said[row], _outcome(flat, row, length))
+            self._file.flush_if_due()
         self._raw_bytes += raw
+        self._file.flush()
+        self._writing = False
+        return list(range(first, len(self._starts)))
 
-    def _write_row(self, layout: Layout, prefix: str, row: dict[tuple[str, ...], Tensor], length: int) -> None:
-        """One rollout: its values [L, ...] by path."""
-        start, per_entry = self._time, layout.steps_per_entry
-        number = np.full((max(length, 1), 1), self._rollouts, np.int64).view(np.uint8)
-        chained = [to_bytes(row[e.key][:1]) for e in layout.numbers if e.chained]
-        message = layout.reset_message().pack([number[:1], *chained])[0]
-        self._message_channel(f"{prefix}/reset", layout.reset_message).log(message, log_time=start)
-        for entry in layout.images:
-            if entry.stored in ("chained", "last_of_frames"):
-                self._log_images(prefix + entry.topic, row[entry.key][0], start)
+    def _layout_index(self, layout: Layout) -> int:
+        layouts = [encoder.layout for encoder in self._encoders]
+        if layout not in layouts:
+            self._file.write_metadata(f"{FORMAT}.layout", {"json": json.dumps(layout.to_json())})
+            prefix = f"/layout_{len(layouts) + 1}" if layouts else ""
+            self._encoders.append(RolloutEncoder(self._file, layout, prefix))
+            return len(layouts)
+        return layouts.index(layout)
 
-        values = [row[e.key if e.stored == "root" else ("next", *e.key)][:length] for e in layout.numbers]
-        steps = np.arange(length, dtype=np.int64)[:, None].view(np.uint8)
-        messages = layout.step_message().pack([number[:length], steps, *map(to_bytes, values)]) if length else []
-        channel = self._message_channel(f"{prefix}/step", layout.step_message)
-        poses = _hand_poses(row.get(("next", *STATE)), length)
-        for step in range(length):
-            time = start + step * per_entry * _PERIOD_NS
-            for entry in layout.images:
-                if entry.stored == "last_of_frames":
-                    continue
-                image = row[entry.key if entry.stored == "root" else ("next", *entry.key)][step]
-                if entry.key == (FRAMES,) and layout.splits_frames:
-                    executed = int(row["next", STEP_MASK][step].sum())
-                    self._log_images(prefix + entry.topic, image[:executed], time + _PERIOD_NS)
-                    unseen = time + (executed + 1) * _PERIOD_NS
-                    self._log_images(f"{prefix}{entry.topic}/after_stop", image[executed:], unseen)
-                else:
-                    self._log_images(prefix + entry.topic, image, time + (0 if entry.stored == "root" else _PERIOD_NS))
-            time += per_entry * _PERIOD_NS
-            if poses is not None:
-                self._typed_channel("/hand", PoseInFrameChannel).log(
-                    PoseInFrame(timestamp=_timestamp(time), frame_id="world", pose=poses[step]), log_time=time
-                )
-            channel.log(messages[step], log_time=time)  # last: a step whose message is there is complete
-        self._time = start + (length * per_entry + 1) * _PERIOD_NS
+    def _write_row(self, index: int, row: dict[tuple[str, ...], Tensor], length: int) -> None:
+        """One rollout: its values [T, ...] by path."""
+        encoder, number, start = self._encoders[index], len(self._starts), self._time
+        encoder.reset([number], [start], {key: value[:1] for key, value in row.items()})
+        for begin in range(0, length, _STEPS_AT_ONCE):
+            steps = range(begin, min(begin + _STEPS_AT_ONCE, length))
+            values = {key: value[begin : steps.stop] for key, value in row.items()}
+            encoder.steps([number] * len(steps), list(steps), [start] * len(steps), values)
+        self._starts.append((start, index, length))
+        self._time = start + encoder.duration(length)
 
-    def _log_images(self, topic: str, images: Tensor, time: int) -> None:
-        """[(C,) 3, H, W] from ``time`` on, one period apart."""
-        images = images.unsqueeze(0) if images.ndim == 3 else images
-        if not len(images):
-            return
-        channel = self._typed_channel(topic, RawImageChannel)
-        pixels = np.ascontiguousarray(images.permute(0, 2, 3, 1).numpy())  # [C, H, W, 3]
-        height, width = pixels.shape[1:3]
-        for image in pixels:
-            message = RawImage(
-                timestamp=_timestamp(time),
-                frame_id="camera",
-                width=width,
-                height=height,
-                encoding="rgb8",
-                step=3 * width,
-                data=image.tobytes(),
-            )
-            channel.log(message, log_time=time)
-            time += _PERIOD_NS
+    def _length(self, number: int) -> int:
+        if not 0 <= number < len(self._starts):
+            raise KeyError(number)
+        return self._starts[number][2]
 
-    def _say(self, text: str, flat: dict[tuple[str, ...], Tensor], row: int, length: int) -> None:
-        """The instruction, and how it ended, at the end of the rollout just written."""
-        success = flat.get(("next", SUCCESS))
-        outcome = ""
-        if success is not None and length:
-            outcome = ": reached" if bool(success[row, :length].any()) else ": not reached"
-        message = Log(
-            timestamp=_timestamp(self._time - _PERIOD_NS),
-            level=LogLevel.Info,
-            message=f"rollout {self._rollouts}: {text}{outcome}",
-            name="instruction",
-        )
-        self._typed_channel("/instruction", LogChannel).log(message, log_time=self._time - _PERIOD_NS)
+    def _step_time(self, number: int, step: int) -> int:
+        start, index, _ = self._starts[number]
+        return start + (step + 1) * self._encoders[index].layout.steps_per_entry * PERIOD_NS
 
-    def _typed_channel(self, topic: str, kind: type) -> Any:
-        if topic not in self._channels:
-            self._channels[topic] = kind(topic, context=self._context)
-        return self._channels[topic]
+    def annotate(self, entries: TensorDictBase, rollouts: Sequence[int] | None = None) -> None:
+        """Adds what became known later (advantages, ratios, clip flags) to rollouts that were written before.
 
-    def _message_channel(self, topic: str, message) -> Channel:
-        if topic not in self._channels:
-            kind = message()
-            schema = Schema(name=kind.name, encoding="protobuf", data=kind.schema())
-            self._channels[topic] = Channel(topic, schema=schema, message_encoding="protobuf", context=self._context)
-        return self._channels[topic]
+        Args:
+            entries: [*B, T], one entry for each of the rollouts' entries, as they were written.
+            rollouts: their numbers; by default the last ones.
+
+        :func:`read_rollouts` gives the entries as if they had been written with the rollouts; where there are none,
+        they are NaN (zero for integers and flags). A later annotation replaces an earlier one.
+
+        Raises:
+            ValueError: for other numbers of rollouts or steps than were written, text or images.
+        """
+        if rollouts is None:
+            count = int(np.prod(entries.shape[:-1], dtype=np.int64))
+            rollouts = range(len(self._starts) - count, len(self._starts))
+        self._annotator.write(entries, rollouts)
+
+    def flush(self) -> None:
+        """Hands everything written to the operating system; :meth:`write` and :meth:`annotate` do."""
+        self._file.flush()
 
     def _compression(self) -> float:
         """Expected size over raw size, with a margin."""
-        if self._raw_bytes < 4 * _CHUNK_BYTES:
+        if self._raw_bytes < _MEASURED:
             return _FIRST_GUESS
-        return 1.5 * (self._partial.stat().st_size + _CHUNK_BYTES // 8) / self._raw_bytes
+        return 1.5 * (self._file.size + _MEASURED // 32) / self._raw_bytes
 
     def close(self) -> None:
         """Finishes the file and gives it its name.
@@ -242,28 +218,26 @@ class RolloutWriter:
         Raises:
             OSError: if the file could not be completed; what was written stays in the partial file.
         """
-        if self._closed:
-            return
-        self._close_file()
-        os.replace(self._partial, self.path)
-
-    def _close_file(self) -> None:
-        self._closed = True
         self._file.close()
-        with open(self._partial, "rb+") as file:
-            file.seek(-8, os.SEEK_END)
-            if file.read() != b"\x89MCAP0\r\n":
-                raise OSError(f"{self._partial} could not be completed: is the disk full?")
-            os.fsync(file.fileno())
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, exception_type: type | None, *_: object) -> None:
         if exception_type is None:
-            self.close()
-        elif not self._closed:
-            self._close_file()
+            self._file.close()
+        elif self._writing and not self._file.closed:
+            self._file.flush()
+            self._file.abort()
+        else:
+            self._file.close_partial()
+
+
+def _outcome(flat: dict[tuple[str, ...], Tensor], row: int, length: int) -> str:
+    success = flat.get(("next", SUCCESS))
+    if success is None or not length:
+        return ""
+    return "reached" if bool(success[row, :length].any()) else "not reached"
 
 
 def _contents(name: str, value: bytes | str | os.PathLike) -> bytes:
@@ -275,16 +249,6 @@ def _contents(name: str, value: bytes | str | os.PathLike) -> bytes:
             raise FileNotFoundError(f"attachment {name!r}: there is no file {path}")
         return path.read_bytes()
     return str(value).encode()
-
-
-def _require_space(path: Path, needed: int) -> None:
-    free = shutil.disk_usage(path.parent).free
-    if free < needed:
-        raise OSError(
-            errno.ENOSPC,
-            f"{path} needs about {needed / 2**20:.0f} MiB more and the disk has {free / 2**20:.0f} MiB free: "
-            "make room or write elsewhere",
-        )
 
 
 def _row_texts(path: tuple[str, ...], value: Any, shape: tuple[int, int], lengths: Tensor) -> list[str]:
@@ -304,21 +268,3 @@ def _row_texts(path: tuple[str, ...], value: Any, shape: tuple[int, int], length
 
 def _flatten(value: Any) -> list:
     return [word for part in value for word in _flatten(part)] if isinstance(value, list) else [value]
-
-
-def _hand_poses(states: Tensor | None, length: int) -> list[Pose] | None:
-    """Poses for the viewer, from position, axis-angle and opening [L, 7]."""
-    if states is None or states.shape[-1] != 7 or not length:
-        return None
-    states = states[:length].double()
-    angle = states[:, 3:6].norm(dim=-1, keepdim=True)
-    axis = states[:, 3:6] / angle.clamp(min=1e-12)
-    quaternion = torch.cat([axis * (angle / 2).sin(), (angle / 2).cos()], -1)
-    return [
-        Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=a, y=b, z=c, w=w))
-        for (x, y, z), (a, b, c, w) in zip(states[:, :3].tolist(), quaternion.tolist(), strict=True)
-    ]
-
-
-def _timestamp(time_ns: int) -> Timestamp:
-    return Timestamp(*divmod(time_ns, 1_000_000_000))

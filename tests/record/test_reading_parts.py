@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from test_round_trip import assert_same, decision_rollouts, step_rollouts, write
+
+from worldenv_trl import keys
+from worldenv_trl.record import RolloutWriter, list_rollouts, part, read_attachments, read_metadata, read_rollouts
+
+OLD = Path(__file__).parent / "format_1"
+
+
+def test_files_of_the_first_format_still_come_back_bit_for_bit():
+    read = read_rollouts(OLD / "steps.mcap")
+    assert_same(read[:3], step_rollouts([6, 3, 1]))
+    assert_same(read[3:, :4], step_rollouts([4, 2, 1], steps=4, seed=5))
+    assert read_metadata(OLD / "steps.mcap") == {"task": "goal/open_the_top_drawer", "seed": 3}
+    assert read_attachments(OLD / "steps.mcap") == {"a": b"xyz"}
+    assert_same(read_rollouts(OLD / "decisions.mcap"), decision_rollouts([[3, 2, 0], [3, 3, 3], [1, 0, 0]]))
+    assert torch.equal(read_rollouts(OLD / "steps.mcap", rollouts=[4])[keys.ACTION][0, :4], read[4][keys.ACTION][:4])
+
+
+def test_rollouts_are_chosen_by_number_through_all_files(tmp_path):
+    first, second = step_rollouts([6, 3, 1]), step_rollouts([5, 2], seed=2)
+    write(tmp_path / "a.mcap", first[:2], first[2:])
+    write(tmp_path / "b.mcap", second)
+    assert_same(read_rollouts(tmp_path, rollouts=[1, 3]), torch.cat([first[1:2], second[:1]]))
+    assert_same(read_rollouts(tmp_path, rollouts=slice(-2, None)), second)
+    assert_same(read_rollouts(tmp_path / "a.mcap", rollouts=2), first[2:])
+    with pytest.raises(ValueError, match="holds the rollouts 0 to 4, not 5"):
+        read_rollouts(tmp_path, rollouts=5)
+
+
+def test_a_time_range_gives_the_rollouts_that_play_in_it(tmp_path):
+    rollouts = step_rollouts([6, 3, 1])  # playing from 0, 0.35 and 0.55 s on
+    write(tmp_path / "a.mcap", rollouts)
+    assert [each.start for each in list_rollouts(tmp_path / "a.mcap")] == [0.0, 0.35, 0.55]
+    assert_same(read_rollouts(tmp_path / "a.mcap", time=(0.4, 0.5)), rollouts[1:2])
+    assert_same(read_rollouts(tmp_path / "a.mcap", time=(0.5, 9.0)), rollouts[1:])
+    with pytest.raises(ValueError, match="no rollouts that were asked for"):
+        read_rollouts(tmp_path / "a.mcap", time=(5.0, 6.0))
+
+
+def test_steps_and_keys_are_chosen(tmp_path, monkeypatch):
+    rollouts = step_rollouts([6, 3])
+    write(tmp_path / "a.mcap", rollouts)
+    read = read_rollouts(tmp_path / "a.mcap", steps=slice(2, 5))
+    assert_same(read, rollouts[:, 2:5])
+    monkeypatch.setattr(part, "_fill", lambda *_: pytest.fail("a frame was decoded"))
+    read = read_rollouts(tmp_path / "a.mcap", keys=[keys.ACTION, ("next", "reward")])
+    assert set(read.keys(True, True)) == {keys.ACTION, ("next", "reward"), keys.MASK}
+    assert torch.equal(read[keys.ACTION][0], rollouts[keys.ACTION][0])
+    with pytest.raises(ValueError, match="holds no entry rewards: it has"):
+        read_rollouts(tmp_path / "a.mcap", keys=["rewards"])
+
+
+def test_chunks_without_a_chosen_rollout_stay_compressed(tmp_path, monkeypatch):
+    parts = [step_rollouts([6, 6], seed=seed) for seed in range(4)]
+    write(tmp_path / "a.mcap", *parts)  # a chunk for each write
+    from worldenv_trl.record.scan import McapScan
+
+    opened = []
+    real = McapScan._opened
+    monkeypatch.setattr(McapScan, "_opened", lambda self, chunk: opened.append(chunk) or real(self, chunk))
+    assert_same(read_rollouts(tmp_path / "a.mcap", rollouts=[5]), parts[2][1:])
+    assert len(opened) == 1
+
+
+def test_annotations_come_back_with_their_rollouts(tmp_path):
+    rollouts = step_rollouts([6, 3, 1])
+    advantage = torch.randn(2, 6, 1)
+    clipped = torch.rand(2, 6, 2) > 0.5
+    with RolloutWriter(tmp_path / "a.mcap") as writer:
+        first = writer.write(rollouts[:1])
+        numbers = writer.write(rollouts[1:])
+        assert (first, numbers) == ([0], [1, 2])
+        writer.annotate(TensorDict({keys.ADVANTAGE: advantage, keys.CLIPPED: clipped}, [2, 6]))
+        writer.annotate(TensorDict({keys.ADVANTAGE: advantage[:1] + 1}, [1, 6]), [1])
+        with pytest.raises(ValueError, match="rollout 7 is not in the file"):
+            writer.annotate(TensorDict({keys.ADVANTAGE: advantage}, [2, 6]), [0, 7])
+        with pytest.raises(ValueError, match=r"up to 6 entries, the annotation has 2"):
+            writer.annotate(TensorDict({keys.ADVANTAGE: advantage[:1, :2]}, [1, 2]), [0])
+        with pytest.raises(ValueError, match="neither images"):
+            writer.annotate(rollouts.select(keys.IMAGE, ("next", *keys.IMAGE)), [0, 1, 2])
+    read = read_rollouts(tmp_path / "a.mcap")
+    assert_same(read.exclude(keys.ADVANTAGE, keys.CLIPPED), rollouts)
+    assert torch.isnan(read[keys.ADVANTAGE][0]).all() and not read[keys.CLIPPED][0].any()
+    assert torch.equal(read[keys.ADVANTAGE][1, :3], advantage[0, :3] + 1)
+    assert torch.equal(read[keys.ADVANTAGE][2, :1], advantage[1, :1])
+    assert torch.equal(read[keys.CLIPPED][1, :3], clipped[0, :3])
+    assert not read[keys.ADVANTAGE][~read[keys.MASK]].any()

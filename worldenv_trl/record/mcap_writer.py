@@ -1,0 +1,216 @@
+"""MCAP records to a stream: the format as it is specified, with as little work for a message as possible."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import BinaryIO
+
+import numpy as np
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+__all__ = ["McapWriter"]
+
+_MAGIC = b"\x89MCAP0\r\n"
+_LEVEL = -1  # 40 % less time than 3 for 23 % more bytes
+_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+_FOOTER = struct.Struct("<BQQQ")
+
+
+class McapWriter:
+    """Writes one file to ``stream``, in compressed chunks of about ``chunk_size`` bytes.
+
+    The ``mcap`` package's own writer takes four times as long for a message, which would be most of what recording
+    costs.
+    """
+
+    def __init__(self, stream: BinaryIO, chunk_size: int) -> None:
+        self._stream, self._chunk_size = stream, chunk_size
+        self._compressor = zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True)
+        self._schemas: list[Schema] = []
+        self._channels: list[Channel] = []
+        self._attachments: list[AttachmentIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._chunks: list[ChunkIndex] = []
+        self._counts: dict[int, int] = {}
+        self._begin_chunk()
+
+    def start(self, library: str) -> None:
+        self._stream.write(_MAGIC + _bytes(Header(profile="", library=library)))
+
+    def add_metadata(self, name: str, values: dict[str, str]) -> None:
+        record = _bytes(Metadata(name=name, metadata=values))
+        self._metadata.append(MetadataIndex(offset=self._stream.tell(), length=len(record), name=name))
+        self._stream.write(record)
+
+    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
+        record = _bytes(Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data))
+        self._attachments.append(
+            AttachmentIndex(
+                offset=self._stream.tell(),
+                length=len(record),
+                create_time=0,
+                log_time=0,
+                data_size=len(data),
+                name=name,
+                media_type=media_type,
+            )
+        )
+        self._stream.write(record)
+
+    def add_schema(self, name: str, encoding: str, data: bytes) -> int:
+        schema = Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
+        self._schemas.append(schema)
+        self._append(_bytes(schema))
+        return schema.id
+
+    def add_channel(self, topic: str, encoding: str, schema: int) -> int:
+        channel = Channel(
+            id=len(self._channels) + 1, topic=topic, message_encoding=encoding, metadata={}, schema_id=schema
+        )
+        self._channels.append(channel)
+        self._append(_bytes(channel))
+        return channel.id
+
+    def block(self, channel: int, times: np.ndarray, sequences: np.ndarray, size: int) -> np.ndarray:
+        """Messages of a channel that all have ``size`` bytes; the caller fills the array that it gets, uint8 [n, size].
+
+        Args:
+            times: int64 [n], ns.
+            sequences: [n], their sequence numbers.
+        """
+        if self._offset > self._chunk_size:
+            self._end_chunk()
+        records = np.empty((len(times), _HEAD.itemsize + size), np.uint8)
+        head = np.empty(len(times), _HEAD)
+        head["opcode"], head["length"], head["channel"] = Opcode.MESSAGE, _HEAD.itemsize - 9 + size, channel
+        head["sequence"], head["log_time"], head["publish_time"] = sequences, times, times
+        records[:, : _HEAD.itemsize] = head.view(np.uint8).reshape(len(times), -1)
+        places = self._offset + records.shape[1] * np.arange(len(times))
+        self._index.setdefault(channel, []).append(np.stack([times, places], -1))
+        self._parts.append(records)
+        self._offset += records.size
+        return records[:, _HEAD.itemsize :]
+
+    def flush(self) -> None:
+        """Ends the chunk and hands everything to the stream's operating system."""
+        self._end_chunk()
+        self._stream.flush()
+
+    def _append(self, record: bytes) -> None:
+        self._parts.append(record)
+        self._offset += len(record)
+
+    def _begin_chunk(self) -> None:
+        self._parts: list[bytes | np.ndarray] = []
+        self._index: dict[int, list[np.ndarray]] = {}  # of each channel: times and places [n, 2]
+        self._offset = 0
+
+    def _end_chunk(self) -> None:
+        if not self._index:
+            return
+        data = b"".join(self._parts)
+        packed = self._compressor.compress(data)
+        entries = {channel: np.concatenate(parts) for channel, parts in self._index.items()}
+        chunk = Chunk(
+            compression="zstd",
+            data=packed,
+            message_start_time=min(int(each[:, 0].min()) for each in entries.values()),
+            message_end_time=max(int(each[:, 0].max()) for each in entries.values()),
+            uncompressed_crc=0,  # zstd checks its own, faster
+            uncompressed_size=len(data),
+        )
+        start, record = self._stream.tell(), _bytes(chunk)
+        offsets, indices, place = {}, [], start + len(record)
+        for channel, each in entries.items():
+            body = struct.pack("<HI", channel, each.nbytes) + each.astype("<u8").tobytes()
+            index = struct.pack("<BQ", Opcode.MESSAGE_INDEX, len(body)) + body
+            offsets[channel] = place
+            place += len(index)
+            indices.append(index)
+            self._counts[channel] = self._counts.get(channel, 0) + len(each)
+        self._chunks.append(
+            ChunkIndex(
+                message_start_time=chunk.message_start_time,
+                message_end_time=chunk.message_end_time,
+                chunk_start_offset=start,
+                chunk_length=len(record),
+                message_index_offsets=offsets,
+                message_index_length=sum(map(len, indices)),
+                compression="zstd",
+                compressed_size=len(packed),
+                uncompressed_size=len(data),
+            )
+        )
+        self._begin_chunk()
+        self._stream.write(b"".join((record, *indices)))
+
+    def finish(self) -> None:
+        """Writes the index that ends a file."""
+        self._end_chunk()
+        self._stream.write(_bytes(DataEnd(data_section_crc=0)))
+        start = self._stream.tell()
+        groups: list[tuple[Opcode, list[McapRecord]]] = [
+            (Opcode.SCHEMA, self._schemas),
+            (Opcode.CHANNEL, self._channels),
+            (Opcode.STATISTICS, [self._statistics()]),
+            (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.ATTACHMENT_INDEX, self._attachments),
+            (Opcode.METADATA_INDEX, self._metadata),
+        ]
+        summary, offsets = b"", []
+        for opcode, records in groups:
+            group = b"".join(map(_bytes, records))
+            if group:
+                offsets.append(
+                    SummaryOffset(group_opcode=opcode, group_start=start + len(summary), group_length=len(group))
+                )
+            summary += group
+        offset_start = start + len(summary)
+        summary += b"".join(map(_bytes, offsets)) + _FOOTER.pack(Opcode.FOOTER, 20, start, offset_start)
+        self._stream.write(summary + struct.pack("<I", zlib.crc32(summary)) + _MAGIC)
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts=self._counts,
+            chunk_count=len(self._chunks),
+            message_count=sum(self._counts.values()),
+            metadata_count=len(self._metadata),
+            message_start_time=min((chunk.message_start_time for chunk in self._chunks), default=0),
+            message_end_time=max((chunk.message_end_time for chunk in self._chunks), default=0),
+            schema_count=len(self._schemas),
+        )
+
+
+def _bytes(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()

@@ -1,0 +1,309 @@
+"""Rollouts of many rows, written as they happen by a thread behind a bounded queue."""
+
+from __future__ import annotations
+
+import json
+import queue
+import threading
+import weakref
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from worldenv_trl.keys import (
+    ACTION,
+    ACTION_MAP,
+    FRAMES,
+    IMAGE,
+    INSTRUCTION,
+    KINEMATIC_STATE,
+    NUM_STEPS,
+    PREDICTED_STATE,
+    ROW,
+    STEP_MASK,
+    SUCCESS,
+    SUCCESS_PROB,
+    TASK_ID,
+    TERMINATION,
+    TERMINATIONS,
+)
+from worldenv_trl.record.annotations import Annotator
+from worldenv_trl.record.encoder import PERIOD_NS, RolloutEncoder
+from worldenv_trl.record.layout import Layout
+from worldenv_trl.record.mcap_file import FLUSH_SECONDS
+from worldenv_trl.record.recording import TEXT
+from worldenv_trl.record.writer import FORMAT, open_file
+
+if TYPE_CHECKING:
+    from worldenv_trl.kinematics import ActionMap, ForwardKinematics
+
+__all__ = ["RolloutStream", "painted"]
+
+_Path = tuple[str, ...]
+_CLOSE = object()
+
+
+class RolloutStream:
+    """Writes steps of rows in the order in which they are put; an error of the thread is raised by the next call.
+
+    Args:
+        path, options: of the file.
+        texts: paths of the entries that are text.
+        rows: of the env.
+        slot_steps: env steps for which a viewer's time line makes room for each rollout.
+        limits: int64 [rows], env steps after which a rollout is truncated, if known: one that ends earlier was cut
+            short.
+        queue_size: steps that may wait.
+        proprio: which state the env shows.
+        kinematics, action_map: see :class:`~worldenv_trl.record.Recorder`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        options: Mapping[str, Any],
+        texts: Sequence[_Path],
+        *,
+        rows: int,
+        slot_steps: int,
+        limits: Tensor | None,
+        queue_size: int,
+        proprio: str = "measured",
+        kinematics: ForwardKinematics | None = None,
+        action_map: ActionMap | None = None,
+    ) -> None:
+        self.path = path
+        self._file = open_file(path, options["metadata"], options["attachments"], options["overwrite"])
+        self._texts, self._slot_steps, self._limits, self._proprio = list(texts), slot_steps, limits, proprio
+        self._kinematics, self._action_map, self._hand = kinematics, action_map, kinematics
+        self._rows, self._before = rows, None  # kinematic states [rows, 20] before the step
+        self._encoder: RolloutEncoder | None = None
+        self._starts: list[int] = []
+        self._lengths: list[int] = []
+        self._said: list[tuple[str, ...]] = []  # distinct ones
+        self._said_of: list[int] = []  # of each rollout
+        self._time = 0
+        self._annotator = Annotator(self._file, f"{FORMAT}.annotation", self._length, self._step_time)
+        self._queue: queue.Queue = queue.Queue(queue_size)
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, name=f"recorder of {path.name}", daemon=True)
+        self._thread.start()
+        # A program that ends without closing its env still completes the file.
+        self._finalizer = weakref.finalize(self, _end, self._queue, self._thread)
+
+    # ------------------------------------------------------------------------------------------------- callers
+
+    def put(
+        self,
+        values: dict[_Path, Tensor],
+        begun: dict[_Path, Tensor],
+        numbers: Tensor,
+        steps: Tensor,
+        fresh: Tensor,
+        said: list[tuple[str, ...]] | None,
+    ) -> None:
+        """Entries [n, ...] of the rollouts ``numbers`` [n] at ``steps`` [n].
+
+        ``fresh`` ones begin: with the observations ``begun`` [f, ...] and these texts. An entry in ``begun`` is given
+        after the step only.
+        """
+        self._hand_over(lambda: self._write(values, begun, numbers.tolist(), steps.tolist(), fresh, said))
+
+    def annotate(self, entries: TensorDictBase, rollouts: Sequence[int]) -> None:
+        self._wait_for(lambda: self._annotator.write(entries, rollouts))
+
+    def flush(self) -> None:
+        self._wait_for(self._file.flush)
+
+    def close(self) -> None:
+        if self._thread.is_alive():
+            self._queue.put(_CLOSE)
+            self._thread.join()
+        self._finalizer.detach()
+        self._raise()
+
+    def _hand_over(self, job) -> None:
+        self._raise()
+        self._queue.put(job)
+
+    def _wait_for(self, job) -> None:
+        done = threading.Event()
+        failed: list[ValueError] = []
+
+        def run() -> None:
+            try:
+                job()
+            except ValueError as error:  # the caller's: the recording goes on
+                failed.append(error)
+            finally:
+                done.set()
+
+        self._hand_over(run)
+        done.wait()
+        self._raise()
+        if failed:
+            raise failed[0]
+
+    def _raise(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    # ------------------------------------------------------------------------------------------------- thread
+
+    def _work(self) -> None:
+        while True:
+            try:
+                job = self._queue.get(timeout=FLUSH_SECONDS / 2)
+            except queue.Empty:
+                job = None
+            try:
+                if job is _CLOSE:
+                    if self._error is None:
+                        self._file.close()
+                    return
+                if self._error is None:
+                    if job is not None:
+                        job()
+                    self._file.flush_if_due()
+            except BaseException as error:
+                self._error = error
+                if not self._file.closed:
+                    self._file.abort()
+
+    def _write(
+        self,
+        values: dict[_Path, Tensor],
+        begun: dict[_Path, Tensor],
+        numbers: list[int],
+        steps: list[int],
+        fresh: Tensor,
+        said: list[tuple[str, ...]] | None,
+    ) -> None:
+        with torch.no_grad():
+            self._derive(values, begun, fresh)
+        self._begin_texts(said)
+        values[(TEXT,)] = torch.tensor([[self._said_of[number]] for number in numbers])
+        if self._encoder is None:
+            flat = {key: value.unsqueeze(1) for key, value in (values | begun).items()}
+            layout = Layout.of(flat, self._texts, torch.ones(len(numbers), 1, dtype=torch.bool))
+            self._file.write_metadata(
+                f"{FORMAT}.stream", {"json": json.dumps({"layout": layout.to_json(), "prefix": ""})}
+            )
+            self._encoder = RolloutEncoder(self._file, layout, "")
+        self._check(values)
+        for number in numbers:
+            if number == len(self._starts):
+                self._starts.append(self._time)
+                self._lengths.append(0)
+                self._time += (self._slot_steps + 1) * PERIOD_NS
+        beginning = fresh.nonzero().squeeze(-1)
+        if len(beginning):
+            first = [numbers[place] for place in beginning.tolist()]
+            self._encoder.reset(first, [self._starts[number] for number in first], begun)
+        self._encoder.steps(numbers, steps, [self._starts[number] for number in numbers], values)
+        for number in numbers:
+            self._lengths[number] += 1
+        self._report(values, numbers)
+
+    @property
+    def _layout(self) -> Layout:
+        return self._encoder.layout
+
+    def _begin_texts(self, said: list[tuple[str, ...]] | None) -> None:
+        for words in said or ():
+            if words not in self._said:
+                self._said.append(words)
+                value = [[list(path), word] for path, word in zip(self._texts, words, strict=True)]
+                self._file.write_metadata(f"{FORMAT}.texts", {"json": json.dumps(value)})
+            self._said_of.append(self._said.index(words))
+
+    def _derive(self, values: dict[_Path, Tensor], begun: dict[_Path, Tensor], fresh: Tensor) -> None:
+        """Adds the entries that are the recorder's own."""
+        after = values.get(("next", KINEMATIC_STATE))
+        if self._kinematics is not None and after is not None and (ACTION,) in values:
+            rows = values[(ROW,)].flatten()
+            if self._before is None:
+                self._before = after.new_zeros(self._rows, after.shape[-1])
+            if bool(fresh.any()):
+                self._before[rows[fresh]] = begun[(KINEMATIC_STATE,)]
+            predicted = self._kinematics(self._before[rows], values[(ACTION,)])
+            values["next", PREDICTED_STATE] = self._kinematics.state(predicted, self._proprio)
+            self._before[rows] = after
+        if self._action_map is not None and after is not None:
+            if self._hand is None:
+                from worldenv_trl.kinematics import ForwardKinematics  # builds on MuJoCo; reading does not need it
+
+                self._hand = ForwardKinematics()
+            pose = self._hand.pose(after)
+            values["next", ACTION_MAP] = painted(self._action_map(pose, values.get(("next", TASK_ID))))
+        ended = [values.get(("next", name)) for name in ("terminated", "truncated")]
+        if None not in ended:
+            values["next", TERMINATION] = self._causes(values, *ended)
+
+    def _causes(self, values: dict[_Path, Tensor], terminated: Tensor, truncated: Tensor) -> Tensor:
+        """int64 [n, 1]."""
+        if not bool((terminated | truncated).any()):
+            return torch.zeros_like(terminated, dtype=torch.int64)
+        success, judged = values.get(("next", SUCCESS)), ("next", SUCCESS_PROB) in values
+        reached = torch.zeros_like(terminated) if success is None else success.reshape(terminated.shape)
+        by_goal = torch.full_like(terminated, TERMINATIONS.index("success"), dtype=torch.int64)
+        stopped = torch.full_like(by_goal, TERMINATIONS.index("reflector" if judged else "success"))
+        limit = torch.full_like(by_goal, TERMINATIONS.index("step limit"))
+        count = values.get(("next", NUM_STEPS))
+        if self._limits is not None and count is not None:
+            most = self._limits[values[(ROW,)].flatten()].reshape(limit.shape)
+            limit[count.reshape(limit.shape) < most] = TERMINATIONS.index("cut short")
+        cause = torch.where(truncated, limit, torch.zeros_like(limit))
+        return torch.where(terminated, stopped if judged else torch.where(reached, by_goal, stopped), cause)
+
+    def _check(self, values: dict[_Path, Tensor]) -> None:
+        """What the first step showed about the entries must hold for all."""
+        for entry in (*self._layout.numbers, *self._layout.images):
+            key = entry.key if entry.stored == "root" else ("next", *entry.key)
+            value = values.get(key)
+            if value is None or tuple(value.shape[1:]) != entry.shape or value.dtype != entry.torch_dtype:
+                found = "is missing" if value is None else f"is {value.dtype} {list(value.shape[1:])}"
+                raise ValueError(f"entry {key} {found}, it was {entry.dtype} {list(entry.shape)} when recording began")
+            if entry.stored == "last_of_frames":
+                last = (values["next", STEP_MASK].sum(-1) - 1).clamp(min=0)
+                shown = values["next", FRAMES][torch.arange(len(last)), last]
+                if not torch.equal(shown, values["next", *IMAGE]):
+                    raise ValueError(f"entry {key} is not the last executed one of {FRAMES!r}, as it was at first")
+
+    def _report(self, values: dict[_Path, Tensor], numbers: list[int]) -> None:
+        """A line of text for each rollout that has ended."""
+        cause = values.get(("next", TERMINATION))
+        if cause is None:
+            return
+        place = next((i for i, path in enumerate(self._texts) if path[-1] == INSTRUCTION), None)
+        for index in cause.flatten().nonzero().squeeze(-1).tolist():
+            number = numbers[index]
+            words = "" if place is None else self._said[self._said_of[number]][place]
+            self._encoder.say(
+                number, self._step_time(number, self._lengths[number] - 1), words, TERMINATIONS[int(cause[index])]
+            )
+
+    def _length(self, number: int) -> int:
+        if not 0 <= number < len(self._lengths):
+            raise KeyError(number)
+        return self._lengths[number]
+
+    def _step_time(self, number: int, step: int) -> int:
+        return self._starts[number] + (step + 1) * self._layout.steps_per_entry * PERIOD_NS
+
+
+def painted(maps: Tensor) -> Tensor:
+    """Action maps [*B, 6, H, W] as images for the eye, uint8 [*B, 3, H, W]: axes red, green and blue, the hand white,
+    its shadow grey."""
+    hand = torch.maximum(maps[..., 0, :, :], maps[..., 4, :, :]).maximum(0.4 * maps[..., 5, :, :])
+    return (torch.maximum(maps[..., 1:4, :, :], hand.unsqueeze(-3)) * 255).round().to(torch.uint8)
+
+
+def _end(jobs: queue.Queue, thread: threading.Thread) -> None:
+    if thread.is_alive() and threading.current_thread() is not thread:
+        jobs.put(_CLOSE)
+        thread.join(timeout=60)
