@@ -18,10 +18,10 @@ import torch
 import tyro
 from tensordict import TensorDict
 
-from both_worlds import BothWorlds, first_success, honesty_of, imagine, judged, live, relive
 from config import WorldEnvConfig
 from parts import load_policy, load_reflector, load_world_model
 from run_folder import RunFolder
+from two_worlds import TwoWorlds, first_success, honesty_of, imagine, judged, live, relive
 from worldenv_trl import keys
 from worldenv_trl.data import episodes_from_rollouts
 from worldenv_trl.metrics import honesty, moving_pixel_psnr
@@ -64,7 +64,7 @@ def main(settings: Report) -> Path:
     torch.set_num_threads(settings.num_threads)
     evidence = gather(record, settings) if settings.models else None
     write_report(record, out, evidence)
-    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
+    print(f"{out}: {out.stat().st_size / 1e3:,.0f} kB")
     if settings.show:
         webbrowser.open(out.resolve().as_uri())
     return out
@@ -83,7 +83,7 @@ def gather(record: RunRecord, settings: Report) -> Evidence:
     if not policies:
         return Evidence(missing=["there is no checkpoint of a policy: run the stage 'sft' first"])
     missing = [] if len(policies) == 2 else ["the stage post_train has not finished: the policy before it is shown"]
-    worlds: dict[str, BothWorlds] = {}
+    worlds: dict[str, TwoWorlds] = {}
     for name in policies:
         print(f"{name}: {settings.episodes_per_task} held-out episodes a task, in the physics and in imagination")
         actor = laplace_actor(load_policy(folder, name, name).eval())
@@ -130,7 +130,7 @@ def _filled(settings: Any, values: dict[str, Any]) -> Any:
     return dataclasses.replace(settings, **found)
 
 
-def clips(worlds: BothWorlds, policy: str, config: WorldEnvConfig, threshold: float) -> list[Clip]:
+def clips(worlds: TwoWorlds, policy: str, config: WorldEnvConfig, threshold: float) -> list[Clip]:
     """Every episode of a policy, in both worlds."""
     names = {load_task(task).task_id: task for task in config.tasks}
     frames, out = worlds.episodes["frames"], []
@@ -179,7 +179,7 @@ def _choose(shown: list[Clip], count: int) -> list[Clip]:
     return chosen
 
 
-def _honesty_rows(worlds: BothWorlds, policy: str, config: WorldEnvConfig) -> list[dict[str, Any]]:
+def _honesty_rows(worlds: TwoWorlds, policy: str, config: WorldEnvConfig) -> list[dict[str, Any]]:
     imagined, real = worlds.outcomes()
     rows = []
     for task, chosen in _by_task(worlds.episodes, config):
@@ -222,7 +222,7 @@ def _relived(config: WorldEnvConfig, path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _frame_scores(worlds: list[BothWorlds]) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+def _frame_scores(worlds: list[TwoWorlds]) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
     """R and the truth of every frame after the first, of all policies."""
     out = {}
     for name in ("real", "imagined"):

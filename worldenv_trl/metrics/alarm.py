@@ -34,6 +34,9 @@ class HonestyAlarm:
     While neither rate moves, or both move alike, every sign is a fair coin, so that the probability of *any* alarm in a
     run is at most ``false_alarm_rate``, however hard the contexts are.
 
+    Imagination that was too strict and catches up while the real rate rises more slowly is no error of the policy, but
+    looks like one: expect more alarms there.
+
     Args:
         probes: probes in the whole run; the alarm needs at least two.
 

@@ -7,9 +7,9 @@ import dataclasses
 import pytest
 import torch
 
-from both_worlds import first_success, judged, live, relive
 from config import GOAL_TASKS, PRESETS
 from parts import tabletop, task_instructions
+from two_worlds import first_success, judged, live, relive
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.data import concatenate_episodes, episodes_from_rollouts

@@ -24,7 +24,7 @@ from worldenv_trl.world_models import VideoWorldModel
 
 
 @dataclass(frozen=True)
-class BothWorlds:
+class TwoWorlds:
     """Episodes ``[R]`` of the physics, the frames that imagination makes of their actions, and what is judged of both.
 
     ``real_scores`` and ``imagined_scores`` are R(o_1:t, g) ``[R, T + 1]``; ``real_stop`` and ``imagined_stop`` int64
@@ -92,12 +92,12 @@ def live(config: WorldEnvConfig, actor, per_task: int, split: str = "test") -> T
     return concatenate_episodes(parts)
 
 
-def imagine(world_model: VideoWorldModel, reflector: CompactReflector, episodes: TensorDict) -> BothWorlds:
+def imagine(world_model: VideoWorldModel, reflector: CompactReflector, episodes: TensorDict) -> TwoWorlds:
     """The actions of physical ``episodes`` [R] in imagination, and the reflector's view of both videos."""
     imagined = imagine_episodes(world_model, episodes, ForwardKinematics())
     scores = {"real": all_scores(reflector, episodes), "imagined": all_scores(reflector, imagined)}
     rule = reflector.config
-    return BothWorlds(
+    return TwoWorlds(
         episodes,
         imagined["frames"],
         scores["real"],
@@ -142,7 +142,7 @@ def relive(config: WorldEnvConfig, imagined: TensorDictBase, split: str = "train
     return torch.cat([torch.zeros(len(success), 1, dtype=torch.bool), success], 1)
 
 
-def honesty_of(worlds: BothWorlds, rows: Tensor | None = None) -> dict:
+def honesty_of(worlds: TwoWorlds, rows: Tensor | None = None) -> dict:
     """:func:`~worldenv_trl.metrics.honesty` of some rows (all by default): outcomes, stop times and drift."""
     rows = torch.arange(len(worlds.episodes)) if rows is None else rows
     imagined, real = (side[rows] for side in worlds.outcomes())
