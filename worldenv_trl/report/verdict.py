@@ -42,7 +42,8 @@ def headline(record: RunRecord, evidence: Evidence | None) -> str:
     tiles = [*_success_tiles(results), *_model_tiles(record, evidence)]
     total = sum(record.seconds.values())
     if total:
-        tiles.append(("Time of the whole run", _duration(total), f"{len(record.seconds)} finished stage{'s' * (len(record.seconds) != 1)}"))
+        count = len(record.seconds)
+        tiles.append(("Time of the whole run", _duration(total), f"{count} finished stage{'s' * (count != 1)}"))
     boxes = "".join(
         f"<div class=tile><dt>{escape(name)}</dt><dd>{value}<small>{note}</small></dd></div>"
         for name, value, note in tiles
