@@ -8,6 +8,7 @@ policies before and after on held-out initial states, in the physics and in imag
 from __future__ import annotations
 
 import dataclasses
+import re
 import webbrowser
 from collections import Counter
 from dataclasses import dataclass
@@ -62,7 +63,14 @@ def main(settings: Report) -> Path:
             f"got {settings.episodes_per_task} and {settings.clips_per_kind}"
         )
     torch.set_num_threads(settings.num_threads)
-    evidence = gather(record, settings) if settings.models else None
+    evidence = None
+    if settings.models:
+        try:
+            evidence = gather(record, settings)
+        except (OSError, ValueError, RuntimeError) as error:  # the logged figures are shown all the same
+            evidence = Evidence(missing=[_short(error)])
+        for what in evidence.missing:
+            print(f"warning: missing in the report: {what}")
     write_report(record, out, evidence)
     print(f"{out}: {out.stat().st_size / 1e3:,.0f} kB")
     if settings.show:
@@ -75,13 +83,10 @@ def gather(record: RunRecord, settings: Report) -> Evidence:
     folder, config = RunFolder(record.path), read_config(record, settings.num_threads)
     models = [path.name for path in sorted((record.path / "checkpoints").glob("reflector*")) if path.is_dir()]
     suffix = models[-1].removeprefix("reflector") if models else ""
-    try:
-        world_model, reflector = load_world_model(folder, suffix), load_reflector(folder, suffix)
-    except (FileNotFoundError, ValueError) as error:
-        return Evidence(missing=[_short(error)])
+    world_model, reflector = load_world_model(folder, suffix), load_reflector(folder, suffix)
     policies = [name for name in ("sft", f"post_train{suffix}") if folder.checkpoint(name).is_dir()]
     if not policies:
-        return Evidence(missing=["there is no checkpoint of a policy: run the stage 'sft' first"])
+        raise FileNotFoundError("there is no checkpoint of a policy: run the stage 'sft' first")
     missing = [] if len(policies) == 2 else ["the stage post_train has not finished: the policy before it is shown"]
     worlds: dict[str, TwoWorlds] = {}
     for name in policies:
@@ -89,7 +94,12 @@ def gather(record: RunRecord, settings: Report) -> Evidence:
         actor = laplace_actor(load_policy(folder, name, name).eval())
         worlds[name] = imagine(world_model, reflector, live(config, actor, settings.episodes_per_task))
     rules = reflector.config
-    waves = [row for path in _waves(record, suffix) for row in _relived(config, path)]
+    waves = []
+    for path in _waves(record, suffix):
+        try:
+            waves += _relived(config, path)
+        except ValueError as error:
+            missing.append(f"the wave {path.name} cannot be replayed: {_short(error)}")
     shown = [clip for name in reversed(policies) for clip in clips(worlds[name], name, config, rules.threshold)]
     return Evidence(
         clips=_choose(shown, settings.clips_per_kind),
@@ -237,7 +247,7 @@ def _frame_scores(worlds: list[TwoWorlds]) -> dict[str, tuple[torch.Tensor, torc
 
 def _short(error: Exception) -> str:
     """The message without the folder's path."""
-    return str(error).split("checkpoints/")[-1]
+    return re.split(r"checkpoints/|rollouts/", str(error))[-1]
 
 
 if __name__ == "__main__":

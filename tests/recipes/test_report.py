@@ -84,6 +84,21 @@ def test_bad_input_gives_one_line(finished, settings, message, tmp_path, monkeyp
     assert not list(tmp_path.iterdir())
 
 
+def test_a_damaged_wave_costs_its_table_and_nothing_else(finished, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    (run / "rollouts" / "post_train_000.mcap").write_bytes(b"no rollouts at all")
+    page = report_of(run, clips_per_kind=1)
+    assert "<video" in page and "What LOOP learned from" not in page
+    assert "warning: missing in the report: the wave post_train_000.mcap" in capsys.readouterr().out
+
+
+def test_a_config_that_is_none_is_named(tmp_path):
+    (tmp_path / "config.yaml").write_text("{ tasks: [")
+    with pytest.raises(SystemExit, match=r"config.yaml holds no settings \(while parsing"):
+        main(Report(tmp_path))
+
+
 def test_a_file_is_no_run_folder_and_stays_as_it_is(tmp_path):
     path = tmp_path / "notes.txt"
     path.write_text("precious")

@@ -129,6 +129,7 @@ class RunRecord:
 
         Raises:
             FileNotFoundError: for a path that is no run folder.
+            ValueError: for a ``config.yaml`` that holds no settings.
         """
         import yaml
 
@@ -137,8 +138,16 @@ class RunRecord:
             what = "does not exist" if not path.exists() else "is no run folder: it holds no config.yaml"
             raise FileNotFoundError(f"{path} {what}; give the --run-dir of recipes/world_env.py")
         lines = read_metrics(path) if (path / "metrics.jsonl").is_file() else []
+        lines = [line for line in lines if isinstance(line, dict) and "stage" in line]
         seconds = {line["stage"]: line["seconds"] for line in lines if "seconds" in line}
-        config = yaml.safe_load((path / "config.yaml").read_text()) or {}
+        try:
+            config = yaml.safe_load((path / "config.yaml").read_text())
+        except yaml.YAMLError as error:
+            config = str(error).splitlines()[0]
+        if not isinstance(config, dict):
+            raise ValueError(
+                f"{path / 'config.yaml'} holds no settings ({config}); the run that wrote it can write it again"
+            )
         return cls(path, lines, config, _versions(), seconds)
 
     def series(self, stage: str, key: str) -> tuple[list[float], list[float]]:
