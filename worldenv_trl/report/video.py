@@ -42,8 +42,10 @@ def video_uri(frames: Tensor, *, fps: int = 10, scale: int = 1, quality: int = 3
         stream = container.add_stream("libvpx-vp9", rate=fps)
         stream.height, stream.width = frames.shape[-2:]
         stream.pix_fmt = "yuv420p"
-        # A key frame every 8: jumping to a step stays quick. One thread: the machine may be shared.
-        stream.options = {"crf": str(quality), "b:v": "0", "g": "8", "cpu-used": "6", "threads": "1", "row-mt": "0"}
+        # A key frame every 8: jumping to a step stays quick. One thread: the machine may be shared. "Real time" is six
+        # times faster than "good" and as exact on renders.
+        speed = {"deadline": "realtime", "cpu-used": "8", "threads": "1"}
+        stream.options = {"crf": str(quality), "b:v": "0", "g": "8"} | speed
         for image in frames.permute(0, 2, 3, 1).contiguous().numpy():
             for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")):
                 container.mux(packet)
