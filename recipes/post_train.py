@@ -7,6 +7,7 @@ Alone: ``python recipes/post_train.py improve --run-dir runs/improve``.
 from __future__ import annotations
 
 import math
+import time
 
 import torch
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -27,7 +28,7 @@ from parts import (
 from run_folder import RunFolder
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
-from worldenv_trl.metrics import honesty
+from worldenv_trl.metrics import HonestyAlarm, honesty
 from worldenv_trl.objectives import LOOPLoss, rloo_advantage
 from worldenv_trl.policies import laplace_actor
 from worldenv_trl.record import RolloutWriter
@@ -66,7 +67,9 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
     mean = AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(settings.averaging))
     mean_actor = laplace_actor(mean.module)
 
-    progress = tqdm(collector, total=settings.iterations, desc=target, unit="it")
+    probed = _probed_iterations(settings)
+    alarm = HonestyAlarm(len(probed), false_alarm_rate=settings.false_alarm_rate) if probed and imagination else None
+    progress, started = tqdm(collector, total=settings.iterations, desc=target, unit="it"), time.monotonic()
     for iteration, wave in enumerate(progress):
         factor = _rate_factor(iteration, settings)
         for group, rate in zip(optimizer.param_groups, full_rates, strict=True):
@@ -94,8 +97,12 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
         collector.update_policy_weights_()
 
         metrics |= _wave_metrics(wave, returns)
-        if settings.probe_every and (iteration % settings.probe_every == 0 or iteration == settings.iterations - 1):
-            metrics |= _probe(config, mean_actor, imagination)
+        metrics["iteration_seconds"], started = time.monotonic() - started, time.monotonic()
+        if iteration in probed:
+            metrics |= _probe(config, mean_actor, imagination, alarm)
+            metrics["probe_seconds"], started = time.monotonic() - started, time.monotonic()
+            if metrics.get("honesty_alarm"):
+                progress.write(_warning(target, iteration, metrics))
         folder.log(target, step=iteration, **metrics)
         progress.set_postfix({k: f"{metrics[k]:.3f}" for k in ("return", "kl_approx", "real_success") if k in metrics})
         if iteration in (0, settings.iterations - 1):
@@ -157,21 +164,44 @@ def _wave_metrics(wave, returns) -> dict[str, float]:
     return metrics
 
 
-def _probe(config, actor, imagination) -> dict[str, float]:
+def _probed_iterations(settings: PostTrain) -> set[int]:
+    """Every ``probe_every``-th iteration, the first and the last."""
+    if not settings.probe_every:
+        return set()
+    return {*range(0, settings.iterations, settings.probe_every), settings.iterations - 1}
+
+
+def _probe(config, actor, imagination, alarm: HonestyAlarm | None) -> dict[str, float]:
     """Greedy success on training contexts: in the physics (the reflector not involved) and in imagination."""
     count = config.post_train.probe_contexts
     if imagination is None:
         indices = torch.linspace(0, config.train_states - 1, min(count, config.train_states)).long().tolist()
         real = [physics_outcomes(config, actor, task, "train", len(indices), indices=indices) for task in config.tasks]
-        return {"real_success": torch.cat(real).float().mean().item()}
+        return {"real_success": torch.cat(real).float().mean().item(), "probe_episodes": len(torch.cat(real))}
     real, imagined = greedy_outcomes(config, actor, *imagination, count)
-    report = honesty(imagined.bool(), real.bool())
+    report = honesty(imagined, real)
+    watch = alarm.update(imagined, real)
     return {
-        "real_success": real.float().mean().item(),
-        "imagined_success": imagined.float().mean().item(),
-        "imagined_precision": float(report["precision"]),
-        "imagined_recall": float(report["recall"]),
+        "real_success": report["real"],
+        "imagined_success": report["imagined"],
+        "imagined_precision": report["precision"],
+        "imagined_recall": report["recall"],
+        "probe_episodes": report["n"],
+        "honesty_alarm": float(watch.fired),
+        "honesty_p": watch.p_value,
+        "imagined_rise": watch.imagined_rise,
+        "real_rise": watch.real_rise,
     }
+
+
+def _warning(target: str, iteration: int, metrics: dict[str, float]) -> str:
+    return (
+        f"warning: {target}, iteration {iteration}: imagined success has risen by {100 * metrics['imagined_rise']:.1f} "
+        f"points since the first probes, real success by {100 * metrics['real_rise']:+.1f} (now "
+        f"{100 * metrics['imagined_success']:.0f} % and {100 * metrics['real_success']:.0f} % of "
+        f"{metrics['probe_episodes']} training contexts, p = {metrics['honesty_p']:.2g}): "
+        "the policy may be learning the world model's errors; training goes on"
+    )
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from worldenv_trl.envs import TabletopEnv
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.record import RolloutWriter, read_rollouts, recorded
 
-TASK = "goal/put_the_bowl_on_the_plate"
+TASK = "starter/put_the_bowl_on_the_plate"
 
 
 @dataclass(frozen=True)

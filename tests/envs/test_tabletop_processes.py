@@ -15,7 +15,7 @@ from worldenv_trl.envs import TabletopEnv
 from worldenv_trl.keys import ACTION, CONTEXT_ID, IMAGE, INSTRUCTION, NUM_STEPS, SIM_STATE, STATE, TASK_ID, WRIST_IMAGE
 from worldenv_trl.scenes import load_task
 
-BOWL, STOVE = "goal/put_the_bowl_on_the_plate", "goal/turn_on_the_stove"
+BOWL, STOVE = "starter/put_the_bowl_on_the_plate", "starter/turn_on_the_stove"
 MIXED = [BOWL, STOVE]
 SEEN = (IMAGE, STATE, SIM_STATE, NUM_STEPS, CONTEXT_ID, TASK_ID)
 

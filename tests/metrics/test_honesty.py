@@ -2,10 +2,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
-from worldenv_trl.metrics import honesty
+from worldenv_trl.metrics import honesty, rank_correlation
 
 IMAGINED = torch.tensor([True, True, True, False, False, True, False, True])
 REAL = torch.tensor([True, False, True, True, False, True, False, False])
@@ -39,3 +40,37 @@ def test_stop_times_are_compared_where_both_succeed():
 def test_outcomes_of_different_length_are_refused():
     with pytest.raises(ValueError, match="same episodes"):
         honesty(IMAGINED, REAL[:3])
+
+
+def test_the_sign_of_the_stop_error_says_who_is_late():
+    steps = torch.tensor([10, 20, 30])
+    report = honesty([True] * 3, [True] * 3, imagined_steps=steps + torch.tensor([3, -1, 4]), real_steps=steps)
+    assert (report["stop_error"], report["stop_bias"]) == pytest.approx((8 / 3, 2.0))
+
+
+def test_arrays_do_as_well_as_tensors():
+    report = honesty(np.asarray(IMAGINED), np.asarray(REAL))
+    assert report == honesty(IMAGINED, REAL)
+    assert (report["n"], report["imagined"], report["real"]) == (8, 5 / 8, 4 / 8)
+
+
+def test_better_policies_should_be_better_in_imagination():
+    policy = torch.arange(4).repeat_interleave(4)
+    real = torch.arange(16) % 4 < policy  # 0, 1, 2, 3 of 4
+    assert honesty(real, real, policy=policy)["rank_correlation"] == pytest.approx(1)
+    turned = torch.arange(16) % 4 < 3 - policy
+    assert honesty(turned, real, policy=policy)["rank_correlation"] == pytest.approx(-1)
+
+
+def test_rank_correlation_is_spearmans_with_ties():
+    # By hand: ranks 1, 2.5, 2.5, 4 and 2, 1, 3, 4, both with mean 2.5.
+    assert rank_correlation([0.1, 0.5, 0.5, 0.9], [2, 1, 3, 4]) == pytest.approx(3.0 / math.sqrt(4.5 * 5))
+    assert math.isnan(rank_correlation([1, 1, 1], [1, 2, 3]))
+    with pytest.raises(ValueError, match="n >= 2"):
+        rank_correlation([1], [1])
+
+
+def test_videos_add_drift():
+    videos = torch.randint(0, 256, (8, 3, 3, 16, 16), dtype=torch.uint8)
+    report = honesty(IMAGINED, REAL, imagined_frames=videos, real_frames=videos)
+    assert report["drift"]["psnr"].tolist() == [60, 60]

@@ -23,7 +23,7 @@ from worldenv_trl.record import Recorder, list_rollouts, model_hash, provenance,
 from worldenv_trl.record.mcap_writer import McapWriter
 from worldenv_trl.scenes import load_task
 
-TASKS = ["goal/open_the_top_drawer", "goal/turn_on_the_stove"]
+TASKS = ["starter/open_the_top_drawer", "starter/turn_on_the_stove"]
 TEXTS = (keys.INSTRUCTION, ("next", keys.INSTRUCTION))
 
 

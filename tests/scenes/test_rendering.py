@@ -30,7 +30,7 @@ def block_means(frame, k=SUPERSAMPLING):
     return np.floor(frame.reshape(size, k, size, k, 3).mean((1, 3)) + 0.5).astype(np.uint8).transpose(2, 0, 1)
 
 
-@pytest.mark.parametrize("name", list_tasks("goal"))
+@pytest.mark.parametrize("name", list_tasks("starter"))
 def test_every_pixel_is_the_mean_of_what_mujoco_draws(name):
     task = load_task(name)
     scene = SceneBatch(task, 3, image_size=48, cameras=tuple(CAMERAS), num_threads=1)
@@ -53,7 +53,7 @@ def test_every_pixel_is_the_mean_of_what_mujoco_draws(name):
 
 
 def test_a_pool_draws_several_models_of_any_number_of_rows_as_each_alone():
-    tasks, counts = [load_task(name) for name in list_tasks("goal")], (5, 1, 2)  # shared by the threads, and not
+    tasks, counts = [load_task(name) for name in list_tasks("starter")], (5, 1, 2)  # shared by the threads, and not
     pool, alone, poses = RendererPool(2), [], []
     drawings = []
     for task, count in zip(tasks, counts, strict=True):
@@ -71,7 +71,7 @@ def test_a_pool_draws_several_models_of_any_number_of_rows_as_each_alone():
 
 
 def test_what_goes_wrong_on_a_thread_is_raised_here_and_the_pool_draws_on():
-    task = load_task("goal/open_the_top_drawer")
+    task = load_task("starter/open_the_top_drawer")
     scene = SceneBatch(task, 4, image_size=16, num_threads=2)
     scene.reset(np.arange(4), task.init_states("train", 4))
     before = scene.render()["agentview"]

@@ -61,7 +61,7 @@ class Recorder(Transform):
         ValueError, FileExistsError, OSError: as :class:`~worldenv_trl.record.RolloutWriter`, from the first step on.
 
     Examples:
-        >>> env = TransformedEnv(TabletopEnv("goal/open_the_top_drawer", 16), Recorder("runs/demo.mcap"))
+        >>> env = TransformedEnv(TabletopEnv("starter/open_the_top_drawer", 16), Recorder("runs/demo.mcap"))
         >>> env.rollout(64)
         >>> env.close()
     """

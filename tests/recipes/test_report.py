@@ -1,0 +1,107 @@
+"""The report of a run folder, from whatever is in it."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+
+import pytest
+import torch
+
+from config import GOAL_TASKS, PRESETS
+from parts import task_instructions
+from report import Report, main
+from run_folder import RunFolder
+from train_world_model import new_model
+from worldenv_trl.policies import OFTConfig, OFTPolicy
+from worldenv_trl.reflectors import CompactReflector, CompactReflectorConfig
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run folder whose models have learned nothing."""
+    torch.manual_seed(0)
+    config = dataclasses.replace(
+        PRESETS["smoke"][1],
+        run_dir=tmp_path_factory.mktemp("runs") / "run",
+        num_threads=1,
+        tasks=GOAL_TASKS[1:2],
+        max_steps=16,
+    )
+    folder = RunFolder(config.run_dir)
+    folder.open(config)
+    policy = OFTPolicy(OFTConfig.for_tasks(task_instructions(config), dim=32, depth=1))
+    for name in ("sft", "post_train"):
+        policy.save_pretrained(folder.checkpoint(name))
+    new_model(config).save_pretrained(folder.checkpoint("world_model"))
+    CompactReflector(CompactReflectorConfig(num_tasks=2)).save_pretrained(folder.checkpoint("reflector"))
+    folder.log("sft", step=0, l1=1.0)
+    return config.run_dir
+
+
+def report_of(run, **settings) -> str:
+    return main(Report(run, **({"episodes_per_task": 2} | settings))).read_text()
+
+
+def test_a_run_with_models_has_episodes_drift_calibration_and_tables(finished, capsys):
+    page = report_of(finished)
+    assert page.count("<video") >= 1 and page.count('class="strip"') == page.count("<video")
+    assert "PSNR of moving pixels against the horizon" in page and "Calibration of the reflector" in page
+    assert "<h3>Held-out contexts" in page and "Missing: calibration" not in page
+    assert "the stage evaluate has not finished" in page  # it is said, not an error
+    assert "report.html" in capsys.readouterr().out
+
+
+def test_without_models_the_report_says_so(finished, tmp_path):
+    page = report_of(finished, models=False, out=tmp_path / "logged.html")
+    assert "<video" not in page and "--no-models" in page
+
+
+def test_a_run_without_a_reflector_names_the_stage_to_run(finished, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    shutil.rmtree(run / "checkpoints" / "reflector")
+    page = report_of(run)
+    assert "train_reflector" in page and "<video" not in page
+    assert str(tmp_path) not in page.replace(str(run), "")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"run": "nowhere"}, "error: nowhere does not exist; give the --run-dir"),
+        ({"out": "missing_folder/report.html"}, "error: the folder missing_folder does not exist"),
+        ({"episodes_per_task": 0}, "episodes-per-task must be at least 1"),
+    ],
+)
+def test_bad_input_gives_one_line(finished, settings, message, tmp_path, monkeypatch):
+    from pathlib import Path
+
+    monkeypatch.chdir(tmp_path)
+    settings = {key: Path(value) if isinstance(value, str) else value for key, value in settings.items()}
+    with pytest.raises(SystemExit, match=message):
+        main(Report(**({"run": finished} | settings)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_wave_costs_its_table_and_nothing_else(finished, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    (run / "rollouts" / "post_train_000.mcap").write_bytes(b"no rollouts at all")
+    page = report_of(run, clips_per_kind=1)
+    assert "<video" in page and "What LOOP learned from" not in page
+    assert "warning: missing in the report: the wave post_train_000.mcap" in capsys.readouterr().out
+
+
+def test_a_config_that_is_none_is_named(tmp_path):
+    (tmp_path / "config.yaml").write_text("{ tasks: [")
+    with pytest.raises(SystemExit, match=r"config.yaml holds no settings \(while parsing"):
+        main(Report(tmp_path))
+
+
+def test_a_file_is_no_run_folder_and_stays_as_it_is(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("precious")
+    with pytest.raises(SystemExit, match="is no run folder"):
+        main(Report(path))
+    assert path.read_text() == "precious"
