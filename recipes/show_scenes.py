@@ -25,7 +25,7 @@ class Sheet:
 
     out: Path = Path("scenes.png")
     suite: str = "goal"
-    """A suite, or a folder of BDDL files."""
+    """A suite (``starter`` is the recipes' own), or a folder of BDDL files."""
     split: str = "train"
     columns: int = 10
     """Initial states of each task, the first ones of the split."""
@@ -49,11 +49,12 @@ def main(settings: Sheet) -> None:
 
 def task_names(suite: str) -> list[str]:
     """The tasks of a suite, or the BDDL files of a folder."""
-    if suite in list_suites():
+    if suite in (*list_suites(), "starter"):
         return list_tasks(suite)
     files = sorted(str(path) for path in Path(suite).glob("*.bddl"))
     if not files:
-        raise SystemExit(f"unknown suite {suite!r}: it must be one of {', '.join(list_suites())}, or a folder of .bddl")
+        known = ", ".join([*list_suites(), "starter"])
+        raise SystemExit(f"unknown suite {suite!r}: it must be one of {known}, or a folder of .bddl files")
     return files
 
 

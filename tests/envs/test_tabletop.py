@@ -307,7 +307,7 @@ def test_actions_are_clipped():
 @pytest.mark.parametrize(
     ("task", "options", "message"),
     [
-        ("goal/open_the_top_drawr", {}, "did you mean 'starter/open_the_top_drawer'"),
+        ("starter/open_the_top_drawr", {}, "did you mean 'starter/open_the_top_drawer'"),
         ([], {}, "task is empty"),
         ([DRAWER, DRAWER], {}, "named twice"),
         (TASKS, {}, "3 tasks need at least 3 rows, got num_envs=2"),

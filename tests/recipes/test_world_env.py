@@ -51,7 +51,7 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"tasks": ("goal/open_the_top_drawr",)}, "did you mean 'starter/open_the_top_drawer'"),
+        ({"tasks": ("starter/open_the_top_drawr",)}, "did you mean 'starter/open_the_top_drawer'"),
         ({"tasks": ()}, "name at least one task"),
         ({"max_steps": 20}, "multiple of chunk_length=8, got 20"),
         ({"post_train": PostTrain(env="robot")}, "'robot'"),

@@ -17,7 +17,7 @@ def test_files_of_the_first_format_still_come_back_bit_for_bit():
     read = read_rollouts(OLD / "steps.mcap")
     assert_same(read[:3], step_rollouts([6, 3, 1]))
     assert_same(read[3:, :4], step_rollouts([4, 2, 1], steps=4, seed=5))
-    assert read_metadata(OLD / "steps.mcap") == {"task": "starter/open_the_top_drawer", "seed": 3}
+    assert read_metadata(OLD / "steps.mcap") == {"task": "goal/open_the_top_drawer", "seed": 3}
     assert read_attachments(OLD / "steps.mcap") == {"a": b"xyz"}
     assert_same(read_rollouts(OLD / "decisions.mcap"), decision_rollouts([[3, 2, 0], [3, 3, 3], [1, 0, 0]]))
     assert torch.equal(read_rollouts(OLD / "steps.mcap", rollouts=[4])[keys.ACTION][0, :4], read[4][keys.ACTION][:4])

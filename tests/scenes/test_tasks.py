@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from worldenv_trl.scenes import SceneBatch, list_suites, list_tasks, load_task, tasks
+from worldenv_trl.scenes import SceneBatch, list_suites, list_tasks, load_task, starter
 from worldenv_trl.scenes.entities.cookware import Stove
 
 NAMES = list_tasks("starter")
@@ -17,21 +17,21 @@ def _scene(name: str, states: np.ndarray, **options) -> SceneBatch:
     return scene
 
 
-def test_the_goal_suite_lists_its_tasks_in_the_order_of_their_ids():
-    assert "goal" in list_suites()
+def test_the_starter_tasks_stand_beside_the_suites_in_the_order_of_their_ids():
+    assert "starter" not in list_suites()
     assert NAMES == ["starter/put_the_bowl_on_the_plate", "starter/open_the_top_drawer", "starter/turn_on_the_stove"]
     loaded = [load_task(name) for name in NAMES]
     assert [task.task_id for task in loaded] == [0, 1, 2]
     assert [task.name for task in loaded] == NAMES
-    assert all(task.suite == "goal" and task.max_steps == 64 and task.language for task in loaded)
+    assert all(task.suite == "starter" and task.max_steps == 64 and task.language for task in loaded)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: load_task("goal/turn_on_the_stve"), "did you mean 'starter/turn_on_the_stove'"),
-        (lambda: load_task("???"), "known tasks: starter/put_the_bowl_on_the_plate"),
-        (lambda: list_tasks("gaol"), "unknown suite 'gaol': it must be one of goal"),
+        (lambda: load_task("starter/turn_on_the_stve"), "did you mean 'starter/turn_on_the_stove'"),
+        (lambda: load_task("???"), "known tasks: spatial/pick_the_bowl"),
+        (lambda: list_tasks("gaol"), "unknown suite 'gaol': it must be one of spatial, object, goal, long, starter"),
         (lambda: load_task(NAMES[0]).init_states("validation"), "'validation': it must be 'train' or 'test'"),
         (lambda: load_task(NAMES[0]).init_states("train", 0), "count must be at least 1, got 0"),
         (lambda: load_task(NAMES[0]).camera("sideview"), "unknown camera 'sideview'"),
@@ -57,7 +57,7 @@ def test_initial_states_are_the_same_when_drawn_again_and_may_be_written_to(name
     changed = task.init_states("test", 4)
     changed[:] = 0.0
     assert np.array_equal(task.init_states("test", 4), first)
-    tasks._init_states.cache_clear()
+    starter._init_states.cache_clear()
     assert np.array_equal(task.init_states("test", 4), first)
 
 

@@ -148,7 +148,7 @@ def _calibration(task: Task, size_px: int) -> dict[str, Any]:
 def _scene_files(task: Task) -> dict[str, bytes]:
     import mujoco
 
-    from worldenv_trl.scenes import tasks
+    from worldenv_trl.scenes import starter
     from worldenv_trl.scenes.files import FileTask
     from worldenv_trl.scenes.settings import compile_scene
 
@@ -158,7 +158,7 @@ def _scene_files(task: Task) -> dict[str, bytes]:
     files = {"mjb": compiled.tobytes()}
     with tempfile.TemporaryDirectory() as folder:
         # MuJoCo writes the text of the model that it compiled last, and tasks keep theirs: compile it once more.
-        fresh = compile_scene(task.problem)[1] if isinstance(task, FileTask) else tasks._build.__wrapped__(task)
+        fresh = compile_scene(task.problem)[1] if isinstance(task, FileTask) else starter._build.__wrapped__(task)
         path = Path(folder) / "scene.xml"
         mujoco.mj_saveLastXML(str(path), fresh)
         files["mjcf"] = path.read_bytes()

@@ -6,7 +6,18 @@ from worldenv_trl.scenes.rendering import RendererPool  # first: where GL is mis
 from worldenv_trl.scenes.camera import Camera
 from worldenv_trl.scenes.catalogue import list_suites, list_tasks, load_task
 from worldenv_trl.scenes.expert import ScriptedExpert
+from worldenv_trl.scenes.perturbed import PerturbedExpert
 from worldenv_trl.scenes.simulation import SceneBatch
 from worldenv_trl.scenes.tasks import Task
 
-__all__ = ["Camera", "RendererPool", "SceneBatch", "ScriptedExpert", "Task", "list_suites", "list_tasks", "load_task"]
+__all__ = [
+    "Camera",
+    "PerturbedExpert",
+    "RendererPool",
+    "SceneBatch",
+    "ScriptedExpert",
+    "Task",
+    "list_suites",
+    "list_tasks",
+    "load_task",
+]

@@ -111,6 +111,12 @@ class ScriptedExpert:
         action[:, 3:6] = np.clip(self._turn(commanded) / ROTATION_STEP, -0.3, 0.3)
         return action
 
+    @property
+    def carrying(self) -> np.ndarray:
+        """``[n]`` bool: the row is in a phase that carries something, after the latest call."""
+        carries = np.array([phase.carries for phase in self.phases])
+        return carries[self.phase]
+
     def _turn(self, commanded: np.ndarray) -> np.ndarray:
         """Rotation vectors ``[n, 3]`` from the commanded rotations ``[n, 3, 3]`` to the wanted ones."""
         cos, sin = np.cos(self._yaw), np.sin(self._yaw)

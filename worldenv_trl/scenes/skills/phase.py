@@ -39,6 +39,11 @@ class Phase:
     yaw: Callable[[SceneBatch], np.ndarray] | None = None
     gentle: bool = False
 
+    @property
+    def carries(self) -> bool:
+        """Whether something hangs in the closed hand, which the phase checks."""
+        return self.gripper == CLOSE and self.still is not None and self.gentle
+
 
 def body(scene: SceneBatch, name: str) -> np.ndarray:
     """Origin of a thing, ``[n, 3]``."""

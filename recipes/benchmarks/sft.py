@@ -1,0 +1,69 @@
+"""How brittle five demonstrations a task leave a policy: SFT on a suite, greedy success on held-out initial states.
+
+``python recipes/benchmarks/sft.py --suite spatial --run-dir runs/sft_spatial`` (one policy for the suite's ten tasks)
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+import tyro
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import demonstrate
+import sft
+from config import SFT, WorldEnvConfig
+from outcomes import physics_outcomes
+from parts import load_policy, seed_everything
+from run_folder import RunFolder
+from worldenv_trl.metrics import wilson_interval
+from worldenv_trl.policies import laplace_actor
+from worldenv_trl.scenes import list_tasks, load_task
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is trained and counted."""
+
+    run_dir: Path
+    suite: str = "spatial"
+    episodes_per_task: int = 20
+    """Held-out initial states of each task, the first ones."""
+    seed: int = 0
+    num_threads: int = 2
+    sft: SFT = field(default_factory=lambda: SFT(steps=3000))
+
+
+def main(settings: Settings) -> None:
+    tasks = tuple(list_tasks(settings.suite))
+    steps = 8 * -(-load_task(tasks[0]).max_steps // 8)  # whole chunks
+    config = WorldEnvConfig(
+        run_dir=settings.run_dir,
+        seed=settings.seed,
+        num_threads=settings.num_threads,
+        tasks=tasks,
+        max_steps=steps,
+        sft=settings.sft,
+    )
+    folder = RunFolder(config.run_dir)
+    folder.open(config)
+    demonstrate.run(config, folder)
+    sft.run(config, folder)
+    seed_everything(config, offset=90)
+    actor = laplace_actor(load_policy(folder, "sft", "sft"))
+    print("| task | solved |\n|---|---|")
+    everything = []
+    for task in tasks:
+        everything.append(physics_outcomes(config, actor, task, "test", settings.episodes_per_task))
+        print(f"| {task} | {int(everything[-1].sum())} / {len(everything[-1])} |", flush=True)
+    success = torch.cat(everything)
+    low, high = wilson_interval(int(success.sum()), len(success))
+    print(f"\n{settings.suite}, seed {settings.seed}: {success.float().mean():.1%} [{low:.1%}, {high:.1%}]")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings, description=__doc__))
