@@ -10,11 +10,8 @@ from show_scenes import Sheet, main
 
 
 def test_the_sheet_has_a_row_for_every_task_and_moment(tmp_path, capsys):
-    main(
-        Sheet(
-            out=tmp_path / "deep" / "sheet.png", suite="starter", columns=2, image_size=32, zoom=3, moments=(0.0, 1.0)
-        )
-    )
+    out = tmp_path / "deep" / "sheet.png"
+    main(Sheet(out=out, suite="starter", columns=2, image_size=32, zoom=3, moments=(0.0, 1.0)))
     sheet = np.asarray(Image.open(out))
     assert sheet.shape == (3 * 2 * 32 * 3, 2 * 32 * 3, 3)
     assert capsys.readouterr().out.count("solved 2 of 2") == 3

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["PerturbedExpert"]
 
 _FLIPPED = 3  # steps that a flip of the gripper lasts
-_UNTIL_RELEASE = 12  # an early release comes at most this many steps after the thing was lifted
+_UNTIL_RELEASE = 22  # an early release comes at most this many steps after the thing was lifted
 _RISING = 4  # steps that the hand rises after it
 
 
@@ -78,7 +78,7 @@ class PerturbedExpert:
         self._rngs[row] = rng = np.random.default_rng([self.seed, row, self._episode[row]])
         self._is_wrong[row] = rng.random() < self.wrong_object
         lets_go = rng.random() < self.early_release
-        self._release_in[row] = rng.integers(1, _UNTIL_RELEASE + 1) if lets_go else -1
+        self._release_in[row] = rng.integers(4, _UNTIL_RELEASE + 1) if lets_go else -1
         self._released[row], self._flipped[row] = 0, 0
 
     def __call__(self, scene: SceneBatch) -> np.ndarray:
