@@ -93,7 +93,9 @@ class Stove(Primitive):
 
 
 class WideStove(Stove):
-    """A stove whose lever stays clear of what stands on its burner, which takes two pots."""
+    """A stove whose lever stays clear of what stands on its burner, which takes two pots; on from LIBERO's 0.5 rad."""
+
+    ON_ABOVE = 0.5
 
     PEG_RADIUS, PIVOT = 0.070, (-0.095, 0.0, 0.035)
     BURNER, BURNER_RADIUS, COOKS_WITHIN = (0.055, 0.0), 0.075, 0.065

@@ -79,7 +79,7 @@ class Cabinet(Primitive):
         ahead = self.REGION_AHEAD
         self._region(drawer, f"{name}_region", (0, ahead, 0.01), (inner - 0.008, back - 0.016 - ahead, 0.028))
         self.states["Open", f"{name}_region"] = JointState(name, -math.inf, self.OPEN_BELOW, (-0.16, -0.14))
-        closed = self.TRAVEL[1] - 0.005 if self.TRAVEL[1] <= 0 else 0.0
+        closed = self.TRAVEL[1] - 0.005 if self.TRAVEL[1] <= 0 else 1e-6  # LIBERO: past 0
         self.states["Close", f"{name}_region"] = JointState(name, closed, math.inf, (max(closed, 0.0), self.TRAVEL[1]))
 
 
