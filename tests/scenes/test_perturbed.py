@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from worldenv_trl.envs import ExpertPolicy, TabletopEnv
 from worldenv_trl.scenes import PerturbedExpert, SceneBatch, ScriptedExpert, load_task
 
 NAME = "object/put_the_soup_in_the_basket"
@@ -91,3 +92,10 @@ def test_impossible_settings_are_refused(options, message):
 def test_a_scene_without_another_thing_has_no_wrong_one():
     with pytest.raises(ValueError, match="wrong_object must be 0"):
         PerturbedExpert(load_task("starter/turn_on_the_stove"), wrong_object=0.5)
+
+
+def test_it_acts_in_an_environment_in_the_expert_s_place():
+    env = TabletopEnv(NAME, 4, cameras=(), max_steps=60, seed=0)
+    policy = ExpertPolicy(env, lambda task: PerturbedExpert(task, early_release=1.0))
+    rollout = env.rollout(60, policy)
+    assert rollout.shape[0] == 4 and not rollout["next", "success"].any()

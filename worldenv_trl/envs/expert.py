@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -9,9 +11,11 @@ from tensordict.nn import TensorDictModuleBase
 
 from worldenv_trl.envs.tabletop import TabletopEnv
 from worldenv_trl.keys import ACTION, ACTION_DIM, NUM_STEPS
-from worldenv_trl.scenes import ScriptedExpert
+from worldenv_trl.scenes import PerturbedExpert, ScriptedExpert, Task
 
 __all__ = ["ExpertPolicy"]
+
+Expert = ScriptedExpert | PerturbedExpert
 
 
 class ExpertPolicy(TensorDictModuleBase):
@@ -19,12 +23,14 @@ class ExpertPolicy(TensorDictModuleBase):
 
     Args:
         env: the environment whose rollouts it acts in (not a copy of it).
+        make_expert: makes the expert of a task, for instance
+            ``lambda task: PerturbedExpert(task, early_release=0.5)`` for failures on purpose.
     """
 
-    def __init__(self, env: TabletopEnv) -> None:
+    def __init__(self, env: TabletopEnv, make_expert: Callable[[Task], Expert] = ScriptedExpert) -> None:
         super().__init__()
         self.in_keys, self.out_keys = [NUM_STEPS], [ACTION]
-        self._parts = [(ScriptedExpert(scene.task), scene, rows) for scene, rows in env.scenes]
+        self._parts = [(make_expert(scene.task), scene, rows) for scene, rows in env.scenes]
         self._num_envs = env.num_envs
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
