@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from worldenv_trl.record.viewers import Curve, Shown, shown_rollouts
@@ -21,9 +22,11 @@ __all__ = ["APPLICATION", "rerun_blueprint", "rerun_recording"]
 APPLICATION = "worldenv_trl"
 # Plots from top to bottom: title, and the entries that belong to it.
 PLOTS = (
-    ("outcome", ("reward", "success", "success_prob", "recorded/psnr")),
+    ("outcome", ("reward", "success", "success_prob")),
+    ("difference from the recording (PSNR, dB)", ("recorded/psnr",)),
     ("action", ("action", "vla_action/chunk")),
-    ("policy", ("vla_action/scale", "vla_action/log_probs", "advantage", "ratio", "clipped")),
+    ("policy", ("vla_action/log_probs", "advantage", "ratio", "clipped")),
+    ("scale", ("vla_action/scale",)),
     ("hand", ("observation/state/position", "states/position", "predicted_state/position")),
 )
 _COLORS = np.array(  # told apart on dark and on light ground
@@ -52,7 +55,7 @@ def rerun_recording(path: str | os.PathLike, rollouts: Sequence[int] | slice = s
     stream.log("world/hand", rr.TransformAxes3D(0.05), static=True)
     named: set[str] = set()
     for rollout in shown:
-        _send(rr, stream, rollout, named)
+        _send(rr, stream, rollout, named, gap=len(shown) > 1)
     stream.send_blueprint(rerun_blueprint(shown))
     return stream
 
@@ -67,7 +70,10 @@ def rerun_blueprint(shown: Sequence[Shown]) -> Any:
     cameras = [rrb.Spatial2DView(origin=f"/camera/{name}", name=title) for name, title in _VIEWS if name in images]
     plots = []
     for title, names in PLOTS:
-        contents = [f"/scalars/{name}" for name in names if name in curves]
+        names = [name for name in names if name in curves]
+        if "states/position" in names:  # every step of a decision, not the last one alone
+            names.remove("observation/state/position")
+        contents = [f"/scalars/{name}" for name in names]
         if contents:
             plots.append(rrb.TimeSeriesView(origin="/scalars", contents=contents, name=title))
     left = [rrb.Grid(*cameras, grid_columns=2)] if cameras else []
@@ -85,7 +91,7 @@ def rerun_blueprint(shown: Sequence[Shown]) -> Any:
     )
 
 
-def _send(rr: Any, stream: Any, rollout: Shown, named: set[str]) -> None:
+def _send(rr: Any, stream: Any, rollout: Shown, named: set[str], gap: bool) -> None:
     def when(steps: Tensor) -> list:
         return [
             rr.TimeColumn("time", duration=rollout.seconds(steps).numpy()),
@@ -115,9 +121,11 @@ def _send(rr: Any, stream: Any, rollout: Shown, named: set[str]) -> None:
             stream.log(
                 f"scalars/{curve.name}", rr.SeriesLines(names=list(curve.labels), colors=_colors(curve)), static=True
             )
-        values = curve.values.numpy()
+        values, steps = curve.values.numpy(), curve.steps
+        if gap:  # NaN ends the line: it does not lead on to the next rollout
+            values, steps = np.pad(values, ((0, 1), (0, 0)), constant_values=np.nan), torch.cat([steps, steps[-1:]])
         columns = rr.Scalars.columns(scalars=values.reshape(-1)).partition([values.shape[1]] * len(values))
-        stream.send_columns(f"scalars/{curve.name}", when(curve.steps), columns)
+        stream.send_columns(f"scalars/{curve.name}", when(steps), columns)
     stream.set_time("time", duration=rollout.start)
     stream.set_time("step", sequence=0)
     said = f"rollout {rollout.number}: {rollout.instruction}" + (f" -> {rollout.outcome}" if rollout.outcome else "")
