@@ -143,7 +143,6 @@ def test_an_edited_action_changes_what_follows_and_nothing_before(solved, tmp_pa
     assert read_metadata(tmp_path / "edit.mcap")["replay"]["branch"]["edits"]["6"] == {"dz": 1.0, "gripper": -1.0}
 
 
-
 def test_another_policy_acts_from_the_branch_on_until_the_step_limit(solved, tmp_path):
     policy = TensorDictModule(lambda state: torch.zeros(*state.shape[:-1], 4, 7), [keys.STATE], [keys.CHUNK])
     report = replay(solved, 0, from_step=5, policy=policy, target=tmp_path / "p.mcap")
@@ -209,11 +208,10 @@ def test_rollouts_without_actions_are_refused(tmp_path):
 
 @pytest.mark.parametrize("text", ["gripper=1", "3", "3 grip=1", "3 dx=4", "9-3 dx=0", "3 dx=--"])
 def test_an_edit_that_cannot_be_read_is_an_error(text):
-    with pytest.raises(ValueError, match="edit|dimensions"):
+    with pytest.raises(ValueError, match=r"edit|dimensions"):
         parse_edit(text)
 
 
 def test_edits_are_read_by_step_and_name():
     assert parse_edit("4 gripper=-1") == {4: {6: -1.0}}
     assert parse_edit(" 4-5 dx=0.5 rz=1e-1 ") == {4: {0: 0.5, 5: 0.1}, 5: {0: 0.5, 5: 0.1}}
-

@@ -50,6 +50,8 @@ def rerun_recording(path: str | os.PathLike, rollouts: Sequence[int] | slice = s
     if not shown:
         raise ValueError(f"{path} holds no rollouts to show")
     stream = rr.RecordingStream(APPLICATION)
+    for name in ("log_time", "log_tick"):  # when it was converted tells nothing
+        stream.disable_timeline(name)
     stream.send_recording_name(Path(path).stem)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     stream.log("world/hand", rr.TransformAxes3D(0.05), static=True)
