@@ -13,7 +13,7 @@ from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import ExpertPolicy, ImaginedEnv, Reflect, TabletopEnv
 from worldenv_trl.kinematics import ForwardKinematics
-from worldenv_trl.record import RolloutWriter, provenance, read_metadata, read_rollouts, replay
+from worldenv_trl.record import RolloutWriter, provenance, read_metadata, read_rollouts, recorded, replay
 from worldenv_trl.reflectors import Reflector
 
 C, SIZE, TASK = 4, 16, "goal/open_the_top_drawer"
@@ -134,6 +134,30 @@ def test_a_model_that_depends_on_its_batch_is_replayed_with_the_rows_of_its_wave
     report = replay(tmp_path / "a.mcap", 2, world_model=model, write=False)
     assert report.exact is True
     assert any("with the 4 rows of its wave" in note for note in report.notes)
+
+
+def test_a_recorder_s_rollouts_are_replayed_with_their_wave_too(tmp_path):
+    model = Painter(together=True)
+    start = TabletopEnv(TASK, 2, image_size=SIZE, seed=0, proprio="commanded").reset()
+    contexts = start.exclude("done", "terminated", "truncated")
+    env = ImaginedEnv(model, ForwardKinematics(), contexts, [2, 2], max_steps=8, chunk_length=C, seed=3)
+    about = provenance(env, models={"world_model": model}, tasks=[TASK])
+    env = recorded(env, tmp_path / "a.mcap", **about)
+    for _ in range(2):
+        env.rollout(4, closing(4))
+    env.close()
+    for number in (1, 6):
+        report = replay(tmp_path / "a.mcap", number, world_model=model, write=False)
+        assert report.exact is True and any("4 rows of its wave" in note for note in report.notes)
+
+
+def test_a_real_rollout_may_go_on_in_imagination_from_one_of_its_frames(tmp_path):
+    env = TabletopEnv(TASK, 1, image_size=SIZE, seed=0, max_steps=12, with_sim_state=True, proprio="commanded")
+    rollout = env.rollout(12)
+    with RolloutWriter(tmp_path / "real.mcap", **provenance(env)) as writer:
+        writer.write(rollout)
+    report = replay(tmp_path / "real.mcap", world_model=Painter(), mode="imagination", from_step=8, write=False)
+    assert [step for step, value in report.psnr.items() if value == float("inf")] == list(range(9))
 
 
 def test_the_reflector_stops_where_it_did_and_another_threshold_stops_elsewhere(tmp_path):

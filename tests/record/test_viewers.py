@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from foxglove import layouts
 from mcap.reader import make_reader
 from PIL import Image
 
@@ -85,6 +86,22 @@ def leaves_of(tree) -> list[str]:
 def test_every_panel_of_the_layout_that_ships_is_arranged_once():
     layout = foxglove_layout()
     assert sorted(leaves_of(layout["layout"])) == sorted(layout["configById"])
+
+
+def test_foxglove_knows_every_setting_of_the_panels():
+    kinds = {
+        "Plot": layouts.PlotPanel,
+        "Image": layouts.ImagePanel,
+        "RosOut": layouts.LogPanel,
+        "RawMessages": layouts.RawMessagesPanel,
+        "3D": layouts.ThreeDeePanel,
+    }
+    for name, panel in foxglove_layout()["configById"].items():
+        known = kinds[name.partition("!")[0]]().config._to_dict().keys() | {"foxglovePanelTitle"}
+        assert panel.keys() <= known, name
+        for line in panel.get("paths", []):
+            assert line.keys() <= layouts.PlotSeries()._to_dict().keys()
+        assert panel.get("imageMode", {}).keys() <= layouts.ImageModeConfig()._to_dict().keys()
 
 
 @pytest.mark.parametrize("kind", ["steps", "decisions", "recorder", "replay"])

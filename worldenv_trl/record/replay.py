@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from worldenv_trl.keys import CHUNK_LENGTH, FRAMES, IMAGE, MASK, SUCCESS, SUCCESS_PROB
 from worldenv_trl.record.provenance import model_hash, package_versions
-from worldenv_trl.record.reader import read_attachments, read_rollouts
+from worldenv_trl.record.reader import list_rollouts, read_attachments, read_rollouts
 from worldenv_trl.record.recording import Recording
 from worldenv_trl.record.replay_branch import Branch, check_edits
 from worldenv_trl.record.replay_imagination import chunks_of, replay_imagination
@@ -202,12 +202,22 @@ def _wave(source: Source) -> tuple[TensorDict, int, int] | None:
     """All rollouts that were imagined together with this one [R, D], its place among them, and the size of groups."""
     batch = source.env.get("batch_size", [])
     part = next((part for part in Recording(source.path).written if source.number in part.numbers), None)
-    if part is None or len(batch) != 2 or len(part.numbers) % (batch[0] * batch[1]):
+    if len(batch) != 2:
         return None
-    rows = batch[0] * batch[1]
-    place = part.numbers.index(source.number)
+    rows, numbers = batch[0] * batch[1], [] if part is None else part.numbers
+    if part is None:  # a recorder's: the rows that began as often
+        infos = [info for info in list_rollouts(source.path) if info.row is not None]
+        episode = next((info.episode for info in infos if info.number == source.number), None)
+        here = sorted((info for info in infos if info.episode == episode), key=lambda info: info.row)
+        numbers = [info.number for info in here]
+    if source.number not in numbers or len(numbers) % rows:
+        return None
+    place = numbers.index(source.number)
     first = place - place % rows
-    return read_rollouts(source.path, rollouts=part.numbers[first : first + rows]), place % rows, batch[1]
+    wave = numbers[first : first + rows]
+    found = read_rollouts(source.path, rollouts=wave)  # in the order of the file
+    order = torch.tensor([sorted(wave).index(number) for number in wave])
+    return found[order], place % rows, batch[1]
 
 
 def _rule(source: Source, reflector: Reflector | None) -> dict[str, float]:

@@ -26,7 +26,7 @@ from worldenv_trl.keys import (
     TASK_ID,
 )
 from worldenv_trl.record.replay_branch import Branch
-from worldenv_trl.record.replay_source import Source
+from worldenv_trl.record.replay_source import Source, observed
 
 if TYPE_CHECKING:
     from worldenv_trl.reflectors import Reflector
@@ -161,5 +161,9 @@ def chunks_of(source: Source, length: int) -> TensorDict:
     out = start.expand(count).clone()
     executed = torch.arange(count * length).reshape(count, length) < len(actions)
     out[CHUNK], out["next"] = padded.reshape(count, length, -1), TensorDict({STEP_MASK: executed}, [count])
+    steps, frames = observed(entries).get("image", (torch.zeros(0), None))
+    if len(steps) == len(actions) + 1:  # every frame is known: a branch may start from them
+        after = frames[1:][torch.arange(count * length).clamp(max=len(actions) - 1)]
+        out["next", FRAMES] = after.unflatten(0, (count, length))
     out[MASK] = torch.ones(count, dtype=torch.bool)
     return out.unsqueeze(0)
