@@ -215,3 +215,29 @@ def test_an_edit_that_cannot_be_read_is_an_error(text):
 def test_edits_are_read_by_step_and_name():
     assert parse_edit("4 gripper=-1") == {4: {6: -1.0}}
     assert parse_edit(" 4-5 dx=0.5 rz=1e-1 ") == {4: {0: 0.5, 5: 0.1}, 5: {0: 0.5, 5: 0.1}}
+
+
+def test_of_a_file_that_was_cut_off_the_steps_that_are_left_are_replayed(tmp_path):
+    whole, cut = tmp_path / "a.mcap", tmp_path / "cut.mcap"
+    env = TabletopEnv(BOWL, 1, image_size=64, seed=0, max_steps=64, with_sim_state=True)
+    record(whole, env)
+    env.close()
+    data = whole.read_bytes()
+    cut.write_bytes(data[: len(data) * 8 // 10])
+    with pytest.warns(UserWarning, match="is truncated"):
+        report = replay(cut, 0)
+    assert report.exact is True and 0 < report.steps < 64
+    assert report.target.exists() and cut.read_bytes() == data[: len(data) * 8 // 10]
+
+
+def test_a_seed_repeats_a_what_if_and_leaves_other_random_numbers_alone(solved):
+    def sample(state):
+        return 0.2 * torch.randn(*state.shape[:-1], 4, 7)
+
+    policy = TensorDictModule(sample, [keys.STATE], [keys.CHUNK])
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    runs = [replay(solved, 0, from_step=8, policy=policy, seed=seed, write=False) for seed in (1, 1, 2)]
+    assert torch.equal(torch.rand(3), expected)
+    assert runs[0].psnr == runs[1].psnr != runs[2].psnr

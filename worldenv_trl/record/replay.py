@@ -98,15 +98,16 @@ def replay(
     recorded = observed(source.entries)
     rule = _rule(source, reflector)
     unchanged = None
-    if mode == "physics":
-        played, first = replay_physics(source, branch, from_step, reflector, rule, notes)
-        same = not source.imagined and _same_versions(source, notes)
-    else:
-        options = {"world_model": world_model, "reflector": reflector, "rule": rule}
-        played, unchanged = _imagined(source, branch, from_step, notes, **options)
-        first = 0
-        same = source.imagined and _same_model(source, "world_model", world_model, notes)
-        same = _same_versions(source, notes) and same
+    with torch.random.fork_rng(devices=[]):  # a branch seeds the policy's samples
+        if mode == "physics":
+            played, first = replay_physics(source, branch, from_step, reflector, rule, notes)
+        else:
+            options = {"world_model": world_model, "reflector": reflector, "rule": rule}
+            played, unchanged = _imagined(source, branch, from_step, notes, **options)
+            first = 0
+    same = _same_versions(source, notes) and source.imagined == (mode == "imagination")
+    if mode == "imagination" and source.imagined:
+        same = _same_model(source, "world_model", world_model, notes) and same
     if reflector is not None:
         same = _same_model(source, "reflector", reflector, notes) and same
     if kind == "exact" and (source.imagined != (mode == "imagination") or not same):
