@@ -167,6 +167,14 @@ def test_the_reflector_stops_where_it_did_and_another_threshold_stops_elsewhere(
     assert same.exact is True and "success_prob" in same.compared
     assert same.outcome["recorded"] == same.outcome["replayed"] and same.outcome["recorded"]["stopped"]
     assert same.outcome["replayed"]["last step"] == 13  # red is 200 / 255 from the fourth decision on
+
+    class Hasty(Redness):
+        def encode(self, frames: Tensor) -> Tensor:
+            return super().encode(frames) * 1.3
+
+    hasty = replay(tmp_path / "a.mcap", 0, world_model=model, reflector=Hasty(), write=False)
+    (end,) = (each for each in hasty.divergences if each.field == "end")
+    assert end.step == 9 and "the recording ends at step 13, the replay at step 9" in str(hasty)
     lower = replay(tmp_path / "a.mcap", 0, world_model=model, reflector=judge, threshold=0.5, write=False)
     assert lower.kind == "what-if" and lower.outcome["replayed"]["last step"] == 9
     # Before the branch nothing stops it, although frames cross the new threshold there.

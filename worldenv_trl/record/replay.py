@@ -19,7 +19,7 @@ from worldenv_trl.record.recording import Recording
 from worldenv_trl.record.replay_branch import Branch, check_edits
 from worldenv_trl.record.replay_imagination import chunks_of, replay_imagination
 from worldenv_trl.record.replay_physics import replay_physics, state_parts
-from worldenv_trl.record.replay_report import ReplayReport, compare, frame_psnr
+from worldenv_trl.record.replay_report import Divergence, ReplayReport, compare, frame_psnr
 from worldenv_trl.record.replay_source import Source, observed, open_rollout
 from worldenv_trl.record.writer import RolloutWriter
 
@@ -116,6 +116,12 @@ def replay(
     parts = state_parts(source) if mode == "physics" and not source.imagined else ()
     against = recorded if unchanged is None else observed(unchanged)
     divergences, compared = compare(against, shown, after=branch.step if branch else -1, state_parts=parts)
+    end = max(int(steps.max()) for steps, _ in shown.values())
+    # Without its reflector an imagined rollout plays its last chunk to the end.
+    if branch is None and (end < source.steps or (end > source.steps and reflector is not None)):
+        words = f"the recording ends at step {source.steps}, the replay at step {end}"
+        divergences.append(Divergence(min(end, source.steps), "end", abs(end - source.steps), words))
+        divergences.sort(key=lambda each: each.step)
     report = ReplayReport(
         source=source.path,
         rollout=rollout,
@@ -123,7 +129,7 @@ def replay(
         kind=kind,
         exact=(not divergences and bool(compared)) if kind == "exact" else None,
         first_step=first,
-        steps=max(int(steps.max()) for steps, _ in shown.values()),
+        steps=end,
         recorded_steps=source.steps,
         compared=tuple(compared),
         divergences=tuple(divergences),
