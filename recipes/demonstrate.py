@@ -9,7 +9,7 @@ import torch
 from tqdm import tqdm
 
 from config import WorldEnvConfig
-from parts import seed_everything, tabletop
+from parts import recording, seed_everything, tabletop
 from run_folder import RunFolder
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
@@ -21,10 +21,13 @@ def run(config: WorldEnvConfig, folder: RunFolder) -> None:
     """Writes ``rollouts/demonstrations.mcap``; raises ``RuntimeError`` if the expert fails one."""
     seed_everything(config, offset=0)
     count = config.demonstrate.episodes_per_task
-    metadata = {"stage": "demonstrate", "tasks": list(config.tasks), "seed": config.seed}
-    with RolloutWriter(folder.rollouts("demonstrations"), metadata=metadata, overwrite=True) as writer:
+    options = {"init_state_mode": "cycle", "terminate_on_success": True, "with_sim_state": True}
+    described = tabletop(config, "train", count, config.tasks[:1], **options)
+    about = recording(config, described, "demonstrate")
+    described.close()
+    with RolloutWriter(folder.rollouts("demonstrations"), **about, overwrite=True) as writer:
         for task in tqdm(config.tasks, desc="demonstrate", unit="task"):
-            env = tabletop(config, "train", count, [task], init_state_mode="cycle", terminate_on_success=True)
+            env = tabletop(config, "train", count, [task], **options)
             collector = GroupCollector(
                 env,
                 ExpertPolicy(env),

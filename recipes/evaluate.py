@@ -10,8 +10,8 @@ from __future__ import annotations
 import torch
 
 from config import WorldEnvConfig
-from outcomes import physics_outcomes
-from parts import load_policy, load_reflector, seed_everything
+from outcomes import outcomes_env, physics_outcomes
+from parts import load_policy, load_reflector, recording, seed_everything
 from run_folder import RunFolder
 from worldenv_trl.metrics import paired_test, wilson_interval
 from worldenv_trl.policies import laplace_actor
@@ -28,11 +28,14 @@ def run(config: WorldEnvConfig, folder: RunFolder, before: str, after: str, mode
     for protocol in ("physics",) if reflector is None else ("physics", "reflector"):
         outcomes: dict[str, dict[str, torch.Tensor]] = {}
         for name in (before, after):
-            actor = laplace_actor(load_policy(folder, name, "post_train"))
-            metadata = {"stage": "evaluate", "policy": name, "protocol": protocol, "tasks": list(config.tasks)}
-            with RolloutWriter(
-                folder.rollouts(f"evaluate_{protocol}_{name}"), metadata=metadata, overwrite=True
-            ) as writer:
+            policy = load_policy(folder, name, "post_train")
+            actor = laplace_actor(policy)
+            judge = reflector if protocol == "reflector" else None
+            described = outcomes_env(config, config.tasks[0], "test", 1, judge, with_sim_state=True)
+            models = {"policy": policy} | ({} if judge is None else {"reflector": judge})
+            about = recording(config, described, "evaluate", models, policy=name, protocol=protocol)
+            described.close()
+            with RolloutWriter(folder.rollouts(f"evaluate_{protocol}_{name}"), **about, overwrite=True) as writer:
                 outcomes[name] = {
                     task: physics_outcomes(
                         config,
@@ -40,7 +43,7 @@ def run(config: WorldEnvConfig, folder: RunFolder, before: str, after: str, mode
                         task,
                         "test",
                         config.evaluate.episodes_per_task,
-                        reflector=reflector if protocol == "reflector" else None,
+                        reflector=judge,
                         writer=writer,
                         label=f"{name}, {protocol} stops",
                     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 from tqdm import tqdm
 
 from config import WorldEnvConfig
-from parts import chunk_player, exploring_actor, load_policy, seed_everything, step_env
+from parts import chunk_player, exploring_actor, load_policy, recording, seed_everything, step_env
 from run_folder import RunFolder
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
@@ -22,12 +22,11 @@ def run(config: WorldEnvConfig, folder: RunFolder, policy: str = "sft", target: 
     model = load_policy(folder, policy, "sft").eval()
     per_scale = -(-settings.episodes_per_task * len(config.tasks) // len(settings.scale_factors))
     waves = -(-per_scale // settings.num_envs)
-    metadata = {"stage": target, "tasks": list(config.tasks), "seed": config.seed, "policy": policy}
     # After success the rollout goes on: the models must see what undoes it (World-Env Figure 6).
-    env = step_env(
-        config, "train", settings.num_envs, terminate_on_success=False, seed=config.seed + 1000 * len(target)
-    )
-    with RolloutWriter(folder.rollouts(target), metadata=metadata, overwrite=True) as writer:
+    options = {"terminate_on_success": False, "with_sim_state": True, "seed": config.seed + 1000 * len(target)}
+    env = step_env(config, "train", settings.num_envs, **options)
+    about = recording(config, env, target, {"policy": model}, policy=policy)
+    with RolloutWriter(folder.rollouts(target), **about, overwrite=True) as writer:
         for factor in settings.scale_factors:
             player = chunk_player(exploring_actor(config, model, max(factor, 1e-6)), config.chunk_length)
             collector = GroupCollector(

@@ -46,20 +46,10 @@ def physics_outcomes(
             "context_ids": [context_id(task_id, split, index) for index in indices],
         }
     num_envs = min(config.evaluate.num_envs, episodes)
-    env = tabletop(
-        config,
-        split,
-        num_envs,
-        [task],
-        init_state_mode="cycle",
-        **options,
-        terminate_on_success=reflector is None,
-    )
-    if reflector is not None:
-        env = TransformedEnv(env, stopping_rule(reflector, real=True))
+    env = outcomes_env(config, task, split, num_envs, reflector, with_sim_state=writer is not None, **options)
     waves = -(-episodes // num_envs)
     collector = GroupCollector(
-        chunked(env, config.chunk_length),
+        env,
         actor,
         groups_per_batch=num_envs,
         group_size=1,
@@ -78,6 +68,17 @@ def physics_outcomes(
             writer.write(rollouts)
     collector.shutdown()
     return torch.tensor([outcome[number] for number in sorted(outcome)][:episodes])
+
+
+def outcomes_env(
+    config: WorldEnvConfig, task: str, split: str, num_envs: int, reflector: CompactReflector | None, **options
+) -> TransformedEnv:
+    """Initial states in order; the goal predicate ends an episode or, with a ``reflector``, the reflector alone."""
+    options = {"init_state_mode": "cycle", "terminate_on_success": reflector is None} | options
+    env = tabletop(config, split, num_envs, [task], **options)
+    if reflector is not None:
+        env = TransformedEnv(env, stopping_rule(reflector, real=True))
+    return chunked(env, config.chunk_length)
 
 
 def imagined_outcomes(

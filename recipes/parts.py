@@ -18,7 +18,7 @@ from worldenv_trl.data import concatenate_episodes, episodes_from_rollouts
 from worldenv_trl.envs import ImaginedEnv, Reflect, TabletopEnv, chunked
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.policies import LaplaceActor, OFTPolicy, laplace_actor
-from worldenv_trl.record import read_rollouts
+from worldenv_trl.record import provenance, read_rollouts
 from worldenv_trl.reflectors import CompactReflector
 from worldenv_trl.scenes import load_task
 from worldenv_trl.world_models import VideoWorldModel
@@ -97,7 +97,7 @@ def step_env(
 def physics_waves_env(config: WorldEnvConfig, groups: int, group_size: int) -> EnvBase:
     """Physics, one chunk a step, rows in groups that share an initial state: LOOP's upper bound."""
     return chunked(
-        tabletop(config, "train", groups * group_size, None, group_repeats=group_size),
+        tabletop(config, "train", groups * group_size, None, group_repeats=group_size, with_sim_state=True),
         config.chunk_length,
     )
 
@@ -144,6 +144,12 @@ def stopping_rule(reflector: CompactReflector, *, real: bool = False) -> Reflect
     if real:
         return Reflect(reflector, threshold=config.real_threshold, consecutive=config.real_consecutive)
     return Reflect(reflector, threshold=config.threshold, consecutive=config.consecutive)
+
+
+def recording(config: WorldEnvConfig, env: EnvBase, stage: str, models: dict | None = None, **more) -> dict:
+    """What a recording of a stage must say about itself, so that it can be replayed: options of RolloutWriter."""
+    more = {"stage": stage, "seed": config.seed} | more
+    return provenance(env, models=models, config=config, tasks=config.tasks, **more)
 
 
 def chunk_player(actor, chunk_length: int) -> MultiStepActorWrapper:

@@ -23,6 +23,7 @@ from parts import (
     load_world_model,
     physics_waves_env,
     read_contexts,
+    recording,
     seed_everything,
 )
 from run_folder import RunFolder
@@ -47,8 +48,9 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
     if settings.env == "imagined":
         imagination = load_world_model(folder, models), load_reflector(folder, models), read_contexts(folder)
         env = imagined_env(config, *imagination, shape)
+        judges = {"world_model": imagination[0], "reflector": imagination[1]}
     else:
-        imagination, env = None, physics_waves_env(config, *shape)
+        imagination, env, judges = None, physics_waves_env(config, *shape), {}
     collector = GroupCollector(
         env,
         actor,
@@ -92,6 +94,9 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
         decisions[keys.STEP_MASK] = decisions["next", keys.STEP_MASK]
         total_steps = decisions[keys.STEP_MASK].sum()  # of Eq. 5: decisions that teach nothing count, too
         decisions = decisions[decisions[keys.ADVANTAGE].squeeze(-1) != 0]
+        about = {}
+        if iteration in (0, settings.iterations - 1):  # of the weights that collected it
+            about = recording(config, env, target, {"policy": policy} | judges, iteration=iteration)
         metrics = _update(decisions, total_steps, loss, optimizer, [lora, heads], settings)
         mean.update_parameters(policy)
         collector.update_policy_weights_()
@@ -105,12 +110,8 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
                 progress.write(_warning(target, iteration, metrics))
         folder.log(target, step=iteration, **metrics)
         progress.set_postfix({k: f"{metrics[k]:.3f}" for k in ("return", "kl_approx", "real_success") if k in metrics})
-        if iteration in (0, settings.iterations - 1):
-            with RolloutWriter(
-                folder.rollouts(f"{target}_{iteration:03d}"),
-                metadata={"stage": target, "tasks": list(config.tasks), "seed": config.seed},
-                overwrite=True,
-            ) as writer:
+        if about:
+            with RolloutWriter(folder.rollouts(f"{target}_{iteration:03d}"), **about, overwrite=True) as writer:
                 writer.write(wave)
     collector.shutdown()
     mean.module.save_pretrained(folder.checkpoint(target))

@@ -201,3 +201,28 @@ def test_the_crossing_frame_ends_a_row_also_when_it_is_the_last_step_that_was_le
 def test_settings_out_of_range_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         Reflect(Brightness(), **settings)
+
+
+class Average(Brightness):
+    """Scores a prefix by the mean of all its frames."""
+
+    def logits(self, features: Tensor, lengths: Tensor, task_id: Tensor) -> Tensor:
+        inside = torch.arange(features.shape[1]) < lengths.unsqueeze(-1)
+        mean = (features[..., 0] * inside).sum(-1) / lengths
+        return torch.logit(mean.clamp(0.001, 0.999))
+
+
+def test_the_last_frame_of_a_chunk_is_scored_with_those_before_it():
+    def scores(around):
+        env = TransformedEnv(TabletopEnv(TASK, 1, image_size=32, seed=0, max_steps=8), Reflect(Average(), 0.999))
+        env = around(env)
+        actions = torch.zeros(1, 8, 7)
+        actions[..., 1] = 1.0
+        td = env.reset()
+        if around is not chunked:
+            for step in range(8):
+                td = env.step(td.set(keys.ACTION, actions[:, step]))["next"]
+            return td[keys.SUCCESS_PROB]
+        return env.step(td.set(keys.CHUNK, actions))["next", keys.SUCCESS_PROB]
+
+    assert torch.equal(scores(chunked), scores(lambda env: env))

@@ -294,3 +294,12 @@ def test_metadata_must_be_plain(tmp_path):
     with pytest.raises(ValueError, match="plain values"):
         RolloutWriter(tmp_path / "a.mcap", metadata={"policy": object()})
     assert json.dumps([p.name for p in tmp_path.iterdir()]) == "[]"
+
+
+def test_physical_states_of_several_tasks_are_padded_to_the_longest(tmp_path):
+    with RolloutWriter(tmp_path / "a.mcap") as writer:
+        for width in (3, 5):
+            writer.write(TensorDict({"sim_state": torch.ones(2, 4, width, dtype=torch.float64)}, [2, 4]))
+    read = read_rollouts(tmp_path / "a.mcap")["sim_state"]
+    assert read.shape == (4, 4, 5)
+    assert read.sum((1, 2)).tolist() == [12, 12, 20, 20] and not read[:2, :, 3:].any()

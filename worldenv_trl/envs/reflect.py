@@ -58,30 +58,33 @@ class Reflect(Transform):
         self.reflector = reflector.eval().requires_grad_(False)
         self.num_frames = num_frames
         self.threshold, self.consecutive = float(threshold), int(consecutive)
-        self._features: Tensor | None = None
+        # TorchRL steps chunks through shallow copies of this transform: all must remember the same rollouts.
+        self._memory: dict[str, Tensor] = {}
 
     # ------------------------------------------------------------------------------------------------- reset
 
     @torch.no_grad()
     def _reset(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        batch = self.parent.batch_size
+        batch, memory = self.parent.batch_size, self._memory
         mask = None if tensordict is None else tensordict.get("_reset", None)
         image = tensordict_reset[IMAGE]
         count = batch.numel()
-        if self._features is None or self._features.shape[0] != count:
-            self._features = torch.zeros(count, 1, self.reflector.feature_dim, device=image.device)
-            self._seen = torch.zeros(count, dtype=torch.int64, device=image.device)
-            self._streak = torch.zeros_like(self._seen)
-            self._prob = torch.zeros(count, device=image.device)
+        if "features" not in memory or memory["features"].shape[0] != count:
+            memory["features"] = torch.zeros(count, 1, self.reflector.feature_dim, device=image.device)
+            memory["seen"] = torch.zeros(count, dtype=torch.int64, device=image.device)
+            memory["streak"] = torch.zeros_like(memory["seen"])
+            memory["prob"] = torch.zeros(count, device=image.device)
         rows = torch.arange(count, device=image.device)
         if mask is not None:
             rows = rows[mask.reshape(-1)]
-        self._features[rows, 0] = self.reflector.encode(image.reshape(-1, *image.shape[-3:])[rows])
-        self._seen[rows], self._streak[rows] = 1, 0
+        memory["features"][rows, 0] = self.reflector.encode(image.reshape(-1, *image.shape[-3:])[rows])
+        memory["seen"][rows], memory["streak"][rows] = 1, 0
         task = tensordict_reset[TASK_ID].reshape(-1, 1)[rows]
-        first = self.reflector.prefix_scores(self._features[rows, :1], torch.zeros_like(rows), 1, task, self.num_frames)
-        self._prob[rows] = first[:, 0]
-        tensordict_reset[SUCCESS_PROB] = self._prob.reshape(*batch, 1).clone()
+        first = self.reflector.prefix_scores(
+            memory["features"][rows, :1], torch.zeros_like(rows), 1, task, self.num_frames
+        )
+        memory["prob"][rows] = first[:, 0]
+        tensordict_reset[SUCCESS_PROB] = memory["prob"].reshape(*batch, 1).clone()
         return tensordict_reset
 
     # ------------------------------------------------------------------------------------------------- step
@@ -114,7 +117,7 @@ class Reflect(Transform):
         shape = (*batch, 1)
         for name, value in (*ended.items(), ("done", done)):
             next_tensordict[name] = value.reshape(shape)
-        prob = self._prob.reshape(shape).clone()
+        prob = self._memory["prob"].reshape(shape).clone()
         next_tensordict[SUCCESS_PROB] = prob
         next_tensordict["reward"] = torch.where(done.reshape(shape), prob, 0.0)
         return next_tensordict
@@ -126,17 +129,17 @@ class Reflect(Transform):
 
     def _judge(self, rows: Tensor, frames: Tensor, executed: Tensor, task_id: Tensor) -> tuple[Tensor, Tensor]:
         """Scores ``frames [n, C]``: whether each row stops ``[n]``, and the index of its last frame ``[n]``."""
-        count = frames.shape[1]
+        count, memory = frames.shape[1], self._memory
         features = self.reflector.encode(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
-        seen = self._seen[rows]
+        seen = memory["seen"][rows]
         needed = int(seen.max()) + count
-        if self._features.shape[1] < needed:
-            spare = max(needed, 2 * self._features.shape[1]) - self._features.shape[1]
-            self._features = torch.nn.functional.pad(self._features, (0, 0, 0, spare))
+        if memory["features"].shape[1] < needed:
+            spare = max(needed, 2 * memory["features"].shape[1]) - memory["features"].shape[1]
+            memory["features"] = torch.nn.functional.pad(memory["features"], (0, 0, 0, spare))
         place = seen.unsqueeze(-1) + torch.arange(count, device=rows.device)
-        self._features[rows.unsqueeze(-1), place] = features
-        scores = self.reflector.prefix_scores(self._features[rows, :needed], seen, count, task_id, self.num_frames)
-        streak, crossed = self._streak[rows], []
+        memory["features"][rows.unsqueeze(-1), place] = features
+        scores = self.reflector.prefix_scores(memory["features"][rows, :needed], seen, count, task_id, self.num_frames)
+        streak, crossed = memory["streak"][rows], []
         for index in range(count):
             streak = torch.where(
                 (scores[:, index] > self.threshold) & executed[:, index], streak + 1, torch.zeros_like(streak)
@@ -145,9 +148,9 @@ class Reflect(Transform):
         crossing = torch.stack(crossed, 1)
         stop = crossing.any(1)
         last = torch.where(stop, crossing.long().argmax(1), executed.sum(1) - 1)
-        self._streak[rows] = streak
-        self._seen[rows] = seen + last + 1
-        self._prob[rows] = scores[torch.arange(len(rows), device=rows.device), last]
+        memory["streak"][rows] = streak
+        memory["seen"][rows] = seen + last + 1
+        memory["prob"][rows] = scores[torch.arange(len(rows), device=rows.device), last]
         return stop, last
 
     def _cut(self, out: TensorDictBase, rows: Tensor, stop: Tensor, last: Tensor, executed: Tensor) -> None:

@@ -6,20 +6,27 @@ from worldenv_trl.record.reader import list_rollouts, read_attachments, read_met
 from worldenv_trl.record.recorder import Recorder, recorded
 from worldenv_trl.record.recording import RolloutInfo
 from worldenv_trl.record.repair import Repair, repair
+from worldenv_trl.record.replay import replay
+from worldenv_trl.record.replay_branch import parse_edit
+from worldenv_trl.record.replay_report import Divergence, ReplayReport
 from worldenv_trl.record.writer import RolloutWriter
 
 __all__ = [
+    "Divergence",
     "MCAPLogger",
     "Recorder",
     "Repair",
+    "ReplayReport",
     "RolloutInfo",
     "RolloutWriter",
     "list_rollouts",
     "model_hash",
+    "parse_edit",
     "provenance",
     "read_attachments",
     "read_metadata",
     "read_rollouts",
     "recorded",
     "repair",
+    "replay",
 ]

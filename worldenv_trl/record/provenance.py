@@ -47,12 +47,13 @@ def provenance(
         more: further plain values of the metadata, for instance ``seed=0``.
 
     Returns:
-        ``metadata``: ``versions`` of packages; ``models``, name -> :func:`model_hash`; ``config``; ``tasks``, their
-        names, and ``task_ids``; ``env``, its class and settings; ``calibration``, by task and camera. ``attachments``:
+        ``metadata``: ``versions`` of packages; ``threads`` of torch; ``models``, name -> :func:`model_hash`;
+        ``config``; ``tasks``, their names, and ``task_ids``; ``env``, its class and settings; ``calibration``, by task
+        and camera. ``attachments``:
         for each task ``<k>.mjcf`` (the scene as text), ``<k>.mjb`` (the compiled scene, which the same version of
         MuJoCo loads) and, for tasks of files, ``<k>.bddl``; k counts the tasks.
     """
-    metadata: dict[str, Any] = {"versions": package_versions()}
+    metadata: dict[str, Any] = {"versions": package_versions(), "threads": torch.get_num_threads()}
     attachments: dict[str, bytes] = {}
     if models:
         metadata["models"] = {name: model_hash(model) for name, model in models.items()}

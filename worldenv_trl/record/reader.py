@@ -13,7 +13,7 @@ import torch
 from tensordict import NonTensorData, NonTensorStack, TensorDict
 from torch import Tensor
 
-from worldenv_trl.keys import EPISODE, MASK, ROW, TASK_ID
+from worldenv_trl.keys import EPISODE, MASK, ROW, SIM_STATE, TASK_ID
 from worldenv_trl.record.mcap_file import PARTIAL_SUFFIX
 from worldenv_trl.record.part import Part
 from worldenv_trl.record.recording import TEXT, Recording, RolloutInfo
@@ -36,9 +36,9 @@ def read_rollouts(
     """The rollouts that were recorded into a file, all files of a folder or those of a glob.
 
     Keys, dtypes and the values where ``("collector", "mask")`` is True are those that were written, bit for bit; the
-    rest is zero. Several writes or files are concatenated along the first dimension and padded to the longest (batch
-    dimensions are flattened where they differ behind the first). Where no rollout is shorter than the others, root and
-    next values that were stored once share memory: clone them before writing in place.
+    rest is zero. Several writes or files are concatenated along the first dimension and padded to the longest, as is
+    ``sim_state`` (batch dimensions are flattened where they differ behind the first). Where no rollout is shorter than
+    the others, root and next values that were stored once share memory: clone them before writing in place.
 
     A file that was cut off or damaged gives, with a warning, of every rollout the steps before the first one that is
     lost. Files of a folder that are still being written (``*.partial.mcap``) are left out.
@@ -222,6 +222,9 @@ def _join(parts: list[Part], path: str | os.PathLike) -> TensorDict:
         if key == ("root", TEXT):
             continue
         values = [each.pop(key) for each in expanded]
+        if key[1:] == (SIM_STATE,):  # as the env does with those of several tasks: zeros up to the longest
+            width = max(value.shape[-1] for value in values)
+            values = [torch.nn.functional.pad(value, (0, width - value.shape[-1])) for value in values]
         if len({(value.dtype, value.shape[2:]) for value in values}) > 1:
             shapes = sorted({str((value.dtype, *value.shape[2:])) for value in values})
             raise ValueError(f"entry {key[1:]} in {path} differs between recordings: {', '.join(shapes)}")

@@ -1,0 +1,135 @@
+"""Plays a recorded rollout again: the same, in another world model, or with something changed.
+
+python recipes/replay.py runs/demo/rollouts/demonstrations.mcap --rollout 3
+python recipes/replay.py runs/demo/rollouts/post_train_000.mcap --rollout 7 --from-step 40 --policy sft
+python recipes/replay.py runs/demo/rollouts/explore.mcap --rollout 7 --edit "43-50 gripper=-1"
+python recipes/replay.py runs/demo/rollouts/demonstrations.mcap --mode imagination --world-model world_model
+
+What was played is written beside the file, the report is printed, and ``--json`` keeps it. Models are looked for among
+the ``checkpoints`` of the run by the hash that was recorded.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from worldenv_trl.policies import OFTPolicy, laplace_actor
+from worldenv_trl.pretrained import CONFIG_NAME
+from worldenv_trl.record import model_hash, parse_edit, read_metadata, replay
+from worldenv_trl.record.replay_source import open_rollout
+from worldenv_trl.reflectors import CompactReflector
+from worldenv_trl.world_models import VideoWorldModel
+
+
+@dataclass(frozen=True)
+class Options:
+    file: tyro.conf.Positional[Path]
+    """A recording."""
+    rollout: int = 0
+    """Number of the rollout in the file."""
+    from_step: int = 0
+    """Env step to begin or to branch at."""
+    mode: str | None = None
+    """``physics`` or ``imagination``; as recorded if not given."""
+    world_model: str | None = None
+    """Checkpoint: a name in the run's checkpoints, or a folder. The recorded one if not given."""
+    reflector: str | None = None
+    """Checkpoint of the reflector that stops the replay, or ``recorded``."""
+    policy: str | None = None
+    """What-if: checkpoint of the policy that acts from ``from_step`` on."""
+    seed: int | None = None
+    """What-if: of the policy's samples (greedy without) and of the world model's noise."""
+    threshold: float | None = None
+    """What-if: the reflector's, from ``from_step`` on."""
+    edit: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """What-if: actions to change, such as "43 gripper=-1" or "40-47 dz=0.5"; may be given several times."""
+    target: Path | None = None
+    """The new file; beside the old one if not given."""
+    json: Path | None = None
+    """Write the report there, too ("-" prints it instead of the words)."""
+    overwrite: bool = False
+    """Replace files that exist."""
+
+
+def main(options: Options) -> int:
+    try:
+        return _replay(options)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+
+
+def _replay(options: Options) -> int:
+    if options.json is not None and str(options.json) != "-" and options.json.exists() and not options.overwrite:
+        raise FileExistsError(f"{options.json} exists: pass --overwrite or another name")
+    metadata = read_metadata(options.file)
+    imagined = options.mode == "imagination" or (
+        options.mode is None and open_rollout(options.file, options.rollout).imagined
+    )
+    reflector = options.reflector or ("recorded" if options.threshold is not None else None)
+    policy = None
+    if options.policy is not None:
+        policy = laplace_actor(_checkpoint(OFTPolicy, options.policy, options.file, metadata, "policy"))
+    edits: dict[int, dict[int, float]] = {}
+    for text in options.edit:
+        for step, values in parse_edit(text).items():
+            edits.setdefault(step, {}).update(values)
+    report = replay(
+        options.file,
+        options.rollout,
+        mode=options.mode,
+        world_model=_checkpoint(VideoWorldModel, options.world_model, options.file, metadata, "world_model")
+        if imagined
+        else None,
+        reflector=None
+        if reflector is None
+        else _checkpoint(CompactReflector, reflector, options.file, metadata, "reflector"),
+        from_step=options.from_step,
+        policy=policy,
+        seed=options.seed,
+        threshold=options.threshold,
+        edits=edits,
+        target=options.target,
+        overwrite=options.overwrite,
+    )
+    words = json.dumps(report.to_json(), indent=2)
+    print(words if str(options.json) == "-" else report)
+    if options.json is not None and str(options.json) != "-":
+        options.json.write_text(words + "\n")
+    return 0
+
+
+def _checkpoint(kind: type, name: str | None, file: Path, metadata: dict, part: str):
+    """A checkpoint by name or folder; without one, that of the run with the recorded hash, else the newest."""
+    folder = file.resolve().parent.parent / "checkpoints"
+    if name is not None and name != "recorded":
+        named = folder / name
+        return kind.from_pretrained(named if named.is_dir() else Path(name)).eval()
+    found = [path.parent for path in folder.glob(f"*/{CONFIG_NAME}") if _class_of(path) == kind.__name__]
+    if not found:
+        raise FileNotFoundError(f"no {kind.__name__} in {folder}: name a checkpoint with --{part.replace('_', '-')}")
+    found.sort(key=lambda path: path.stat().st_mtime)
+    recorded = metadata.get("models", {}).get(part)
+    models = {path: kind.from_pretrained(path).eval() for path in found}
+    for model in models.values():
+        if model_hash(model) == recorded:
+            return model
+    return models[found[-1]]  # the replay says that it is another one
+
+
+def _class_of(path: Path) -> str:
+    try:
+        return json.loads(path.read_text()).get("class", "")
+    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError):
+        return ""
+
+
+if __name__ == "__main__":
+    warnings.filterwarnings("ignore", message="Creating .*WeightUpdater")
+    sys.exit(main(tyro.cli(Options, description=__doc__)))

@@ -1,0 +1,88 @@
+"""Shows recorded rollouts: ``python recipes/view.py runs/demo/rollouts/explore.mcap --rollout 3``.
+
+Rerun opens with images, the action map, the hand's path, text and plots, or ``--save rollout.rrd`` keeps all that in a
+file (no display is needed). With ``--viewer foxglove`` a layout is written for the file, and Foxglove is started if it
+is installed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from worldenv_trl.record.viewers_foxglove import foxglove_layout
+from worldenv_trl.record.viewers_rerun import rerun_recording
+
+MOST = 16  # rollouts that are shown if none is named
+
+
+@dataclass(frozen=True)
+class Options:
+    file: tyro.conf.Positional[Path]
+    """A recording."""
+    rollout: tuple[int, ...] = ()
+    """Numbers of rollouts; the first 16 if none is given."""
+    viewer: Literal["rerun", "foxglove"] = "rerun"
+    save: Path | None = None
+    """Write this file (.rrd for Rerun, .json for Foxglove's layout) instead of opening a window."""
+    overwrite: bool = False
+    """Replace a file that exists."""
+
+
+def main(options: Options) -> int:
+    try:
+        if options.save is not None and options.save.exists() and not options.overwrite:
+            raise FileExistsError(f"{options.save} exists: pass --overwrite or another name")
+        return _foxglove(options) if options.viewer == "foxglove" else _rerun(options)
+    except (ValueError, OSError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+
+
+def _rerun(options: Options) -> int:
+    if options.save is None and not has_display():
+        raise OSError("there is no display to open a window on: pass --save rollouts.rrd and open that elsewhere")
+    recording = rerun_recording(options.file, options.rollout or slice(MOST))
+    if options.save is None:
+        recording.spawn()
+        return 0
+    options.save.parent.mkdir(parents=True, exist_ok=True)
+    partial = options.save.with_name(options.save.name + ".partial")
+    recording.save(partial)
+    recording.disconnect()
+    os.replace(partial, options.save)
+    print(f"{options.save}: open it with rerun {options.save}")
+    return 0
+
+
+def _foxglove(options: Options) -> int:
+    layout = json.dumps(foxglove_layout(options.file), indent=1)
+    target = options.save or options.file.with_name(f"{options.file.stem}.foxglove.json")
+    if target.exists() and not options.overwrite and target.read_text() != layout:
+        raise FileExistsError(f"{target} exists: pass --overwrite or --save another name")
+    target.write_text(layout)
+    program = shutil.which("foxglove-studio") or shutil.which("foxglove")
+    if options.save is None and program is not None and has_display():
+        subprocess.Popen([program, str(options.file.resolve())], start_new_session=True)
+    else:
+        print(f"open {options.file} in Foxglove (desktop or app.foxglove.dev)")
+    print(f"layout: {target} (Foxglove: Layouts, Import from file)")
+    return 0
+
+
+def has_display() -> bool:
+    if sys.platform != "linux":
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, description=__doc__)))
