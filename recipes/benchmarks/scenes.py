@@ -63,7 +63,7 @@ def named_tasks(names: tuple[str, ...]) -> list[Task]:
     """The tasks that suites, tasks and files mean, each once."""
     wanted: list[str] = []
     for name in names:
-        wanted += list_tasks(name) if name in list_suites() else [name]
+        wanted += list_tasks(name) if name in (*list_suites(), "starter") else [name]
     return [load_task(name) for name in dict.fromkeys(wanted)]
 
 
