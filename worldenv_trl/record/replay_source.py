@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -159,7 +159,7 @@ def recorded_task(source: Source, notes: list[str]) -> Task:
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / "task.bddl"
                 path.write_bytes(text)
-                task = replace(load_bddl(path), name=names[place])
+                task = load_bddl(path, name=names[place], task_id=number)
         else:
             task = load_task(names[place])
         _compare_scene(task, attached.get(f"{place}.mjb"), source, notes)
