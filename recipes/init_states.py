@@ -1,4 +1,4 @@
-"""Draws the standard initial states of the suites' tasks and stores them beside their files.
+"""Draws the standard initial states of the suites' tasks and stores them beside their files, over those that are there.
 
 ``python recipes/init_states.py``, after a task file has changed; 50 of each split, fixed by the file's text.
 """
@@ -23,6 +23,9 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
+    unknown = set(settings.suites) - set(list_suites())
+    if unknown:
+        raise SystemExit(f"unknown suite {unknown.pop()!r}: it must be one of {', '.join(list_suites())}")
     for suite in settings.suites:
         for name in list_tasks(suite):
             task = load_task(name)

@@ -1,7 +1,7 @@
 """A contact sheet of the scenes: for every task, initial states, the expert at work, and where it ends.
 
-``python recipes/show_scenes.py --suite goal --out scenes.png``, or ``--suite <folder of BDDL files>``, which have no
-expert: their initial states alone.
+``python recipes/show_scenes.py --suite goal --out scenes.png``, or ``--suite <folder of BDDL files>``, of
+which the initial states alone are shown.
 """
 
 from __future__ import annotations

@@ -48,6 +48,8 @@ def main(options: Options) -> int:
 
 
 def _rerun(options: Options) -> int:
+    if not options.file.exists():
+        raise FileNotFoundError(f"there is no file {options.file}")
     if options.save is None and not has_display():
         raise OSError("there is no display to open a window on: pass --save rollouts.rrd and open that elsewhere")
     recording = rerun_recording(options.file, options.rollout or slice(MOST))

@@ -23,14 +23,16 @@ class Settings:
     """What is counted."""
 
     tasks: tuple[str, ...] = ()
-    """Tasks or files; none: every task of every suite."""
+    """Tasks, suites or files; none: every task of the four suites."""
     count: int = 50
     """Initial states of each split."""
     processes: int = 2
 
 
 def main(settings: Settings) -> None:
-    tasks = settings.tasks or tuple(name for suite in list_suites() for name in list_tasks(suite))
+    suites = [*list_suites(), "starter"]
+    wanted = settings.tasks or list_suites()
+    tasks = [task for name in wanted for task in (list_tasks(name) if name in suites else [name])]
     start = time.perf_counter()
     with multiprocessing.get_context("spawn").Pool(settings.processes) as pool:
         results = pool.starmap(count_successes, [(name, settings.count) for name in tasks], chunksize=1)

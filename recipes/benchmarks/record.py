@@ -119,7 +119,8 @@ def _thread_seconds(thread) -> float:
 def rates(settings: Benchmark, rollouts: TensorDict, folder: Path) -> None:
     count = rollouts.numel()
     written, read, steps = [], [], []
-    thousand = rollouts.reshape(-1)[:1000].reshape(25, 40)
+    flat = rollouts.reshape(-1)
+    thousand = flat[torch.arange(1000) % len(flat)].reshape(25, 40)
     for index in range(settings.repeats):
         started = time.perf_counter()
         with RolloutWriter(folder / f"{index}.mcap") as writer:

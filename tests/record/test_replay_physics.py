@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import ExpertPolicy, TabletopEnv, chunked
-from worldenv_trl.record import RolloutWriter, parse_edit, provenance, read_metadata, read_rollouts, replay
+from worldenv_trl.record import RolloutWriter, parse_edit, provenance, read_metadata, read_rollouts, recorded, replay
 
 TASKS = ["starter/put_the_bowl_on_the_plate", "starter/open_the_top_drawer"]
 BOWL, FILE = "starter/put_the_bowl_on_the_plate", "put_the_bowl.bddl"
@@ -241,3 +241,15 @@ def test_a_seed_repeats_a_what_if_and_leaves_other_random_numbers_alone(solved):
     runs = [replay(solved, 0, from_step=8, policy=policy, seed=seed, write=False) for seed in (1, 1, 2)]
     assert torch.equal(torch.rand(3), expected)
     assert runs[0].psnr == runs[1].psnr != runs[2].psnr
+
+
+@pytest.mark.parametrize("name", ["spatial/pick_the_bowl_on_the_stove", "long/put_both_moka_pots_on_the_stove"])
+def test_a_task_of_a_suite_is_found_in_its_recording(tmp_path, name):
+    env = TabletopEnv([name, "starter/turn_on_the_stove"], 2, image_size=32, max_steps=6, seed=0)
+    path = tmp_path / "suite.mcap"
+    recording = recorded(env, path, **provenance(env))
+    recording.rollout(6, ExpertPolicy(env))
+    recording.close()
+    for rollout in range(2):
+        report = replay(path, rollout=rollout)
+        assert report.exact, str(report)

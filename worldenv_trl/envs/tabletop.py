@@ -127,6 +127,10 @@ class TabletopEnv(EnvBase):
             raise ValueError(f"max_steps must be at least 1, got {max_steps}")
         if init_states is not None and len(tasks) > 1:
             raise ValueError("init_states are of one task: build one env for each task")
+        if isinstance(cameras, str):
+            raise ValueError(f"cameras must be a sequence of names, got {cameras!r}: write ({cameras!r},)")
+        if len(set(cameras)) < len(cameras):
+            raise ValueError(f"a camera is named twice: {', '.join(cameras)}")
         for name in cameras:
             if name not in _IMAGE_NAMES:
                 raise ValueError(f"unknown camera {name!r}: it must be one of {', '.join(_IMAGE_NAMES)}")

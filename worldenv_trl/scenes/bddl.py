@@ -7,6 +7,7 @@ a comment. The dialect was read off LIBERO's 130 files; the parser is our own.
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -67,7 +68,7 @@ def read_bddl(path: str | Path) -> Problem:
     if not path.is_file():
         raise FileNotFoundError(f"there is no task file {path}")
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise BDDLError(f"{path}: not a text file ({error.reason} at byte {error.start})") from error
     return parse_bddl(text, str(path))
@@ -311,5 +312,7 @@ class _Parser:
             raise self.error(node, f"{name} takes {count} argument(s), got {len(arguments)}")
         for argument in arguments:
             if argument.word not in names and argument.word not in regions:
-                raise self.error(argument, "this is neither a fixture, an object nor a region of this file")
+                close = difflib.get_close_matches(argument.word, [*names, *regions], n=1, cutoff=0.6)
+                hint = f": did you mean {close[0]!r}?" if close else ""
+                raise self.error(argument, f"this is neither a fixture, an object nor a region of this file{hint}")
         return (name, *(argument.word for argument in arguments))

@@ -93,14 +93,18 @@ class Layout:
             ready = [item for item in waiting if item[1] in placed]
             if not ready:
                 thing, carrier, _ = waiting[0]
-                raise ValueError(f"{self.problem.source}: {thing} stands on {carrier}, which has no place in :init")
+                circular = carrier in {item[0] for item in waiting}
+                lost = "stands on it in turn" if circular else "has no place in :init"
+                raise ValueError(f"{self.problem.source}: {thing} stands on {carrier}, which {lost}")
             ordered += ready
             placed |= {item[0] for item in ready}
             waiting = [item for item in waiting if item not in ready]
         self._carried = ordered
         lost = [name for name in self.entities if name not in placed]
         if lost:
-            raise ValueError(f"{self.problem.source}: {lost[0]} has no place in :init")
+            raise ValueError(
+                f"{self.problem.source}: {lost[0]} has no place in :init: say where it starts, (On {lost[0]} <region>)"
+            )
 
     # ------------------------------------------------------------------------------------------------- drawing
 

@@ -70,7 +70,9 @@ def setting_of(problem: Problem) -> Setting:
     if problem.kind not in SETTINGS:
         close = difflib.get_close_matches(problem.kind, SETTINGS, n=1, cutoff=0.4)
         hint = f"did you mean {close[0]!r}?" if close else f"known ones: {', '.join(SETTINGS)}"
-        raise ValueError(f"{problem.source}: unknown problem class {problem.kind!r}: {hint}")
+        raise ValueError(
+            f"{problem.source}: unknown class {problem.kind!r} in (problem ...), where the task plays: {hint}"
+        )
     return SETTINGS[problem.kind]
 
 

@@ -52,8 +52,8 @@ class SceneBatch:
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        if image_size < 16:
-            raise ValueError(f"image_size must be at least 16 px, got {image_size}")
+        if not isinstance(image_size, int) or image_size < 16:
+            raise ValueError(f"image_size must be a whole number of at least 16 px, got {image_size!r}")
         self.task, self.num_envs, self.image_size = task, num_envs, image_size
         self.model = task.build()
         known = {_short_name(full): full for full in (self.model.camera(i).name for i in range(self.model.ncam))}

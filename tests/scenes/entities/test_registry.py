@@ -81,8 +81,6 @@ def test_the_states_of_a_joint_exclude_each_other_and_can_be_reached(category):
 
 
 def test_an_unknown_category_names_the_closest():
-    with pytest.raises(
-        ValueError, match="unknown object category 'wooden_cabnet' of 'a_1': did you mean wooden_cabinet"
-    ):
+    with pytest.raises(ValueError, match="unknown category 'wooden_cabnet' of 'a_1': did you mean wooden_cabinet"):
         make_entity("wooden_cabnet", "a_1")
     assert not set(WORKSPACES) & set(CATEGORIES)

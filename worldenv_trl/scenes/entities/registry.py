@@ -98,8 +98,8 @@ WORKSPACES = ("table", "floor", "kitchen_table", "living_room_table", "study_tab
 def make_entity(category: str, name: str) -> Primitive:
     """An entity of ``category`` called ``name``; raises ``ValueError`` naming close categories for an unknown one."""
     if category not in CATEGORIES:
-        close = difflib.get_close_matches(category, CATEGORIES, n=3, cutoff=0.4)
+        close = difflib.get_close_matches(category, CATEGORIES, n=2, cutoff=0.6)
         hint = f"did you mean {' or '.join(close)}?" if close else f"known ones: {', '.join(CATEGORIES)}"
-        raise ValueError(f"unknown object category {category!r} of {name!r}: {hint}")
+        raise ValueError(f"unknown category {category!r} of {name!r}: {hint}")
     found = CATEGORIES[category]
     return found.entity(name, **found.options)
