@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from worldenv_trl.policies import OFTConfig
 from worldenv_trl.scenes import SceneBatch, ScriptedExpert, list_suites, list_tasks, load_task
 from worldenv_trl.scenes.initial import draw_poses, load_poses, states_from_poses
 
@@ -26,6 +27,7 @@ def test_there_are_four_suites_of_ten_tasks_each_with_words_and_a_number_of_its_
     assert [len(list_tasks(suite)) for suite in list_suites()] == [10] * 4
     assert [task.name for task in tasks] == NAMES
     assert len({task.task_id for task in tasks}) == len({task.language for task in tasks}) == 40
+    assert max(len(task.language.split()) for task in tasks) <= OFTConfig.max_words
     assert all(task.name.startswith(f"{task.suite}/") for task in tasks)
     assert {task.language.split()[0] for task in tasks} >= {"put", "place", "pick", "open", "turn", "push", "take"}
 
