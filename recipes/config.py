@@ -150,7 +150,7 @@ class WorldEnvConfig:
     """``suite/name``, each once."""
     image_size: int = 64
     chunk_length: int = 8
-    max_steps: int = 64
+    max_steps: int = 72
     """Env steps (20 Hz) of an episode at most, a multiple of ``chunk_length``."""
     scale_floor: tuple[float, float, float] = (0.04, 0.0025, 0.15)
     """Lower bound of the Laplace scale of position, rotation and gripper, in normalised action units.

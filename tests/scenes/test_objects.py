@@ -35,7 +35,7 @@ def _drive(scene: SceneBatch, goal: np.ndarray, gripper: float, steps: int, spee
 def _lift(offset: tuple[float, float, float], rows: int = 8) -> np.ndarray:
     """Height gained by the bowl ``[rows]`` when the hand closes ``offset`` away from the middle of the rim."""
     scene = _scene(BOWL, rows)
-    bowl = scene.model.body("bowl/").id
+    bowl = scene.model.body("bowl_1/").id
     rim = scene.xpos[:, bowl] + (0.0, Bowl.RIM_RADIUS - 0.004, GRIP) + offset
     start = scene.xpos[:, bowl, 2].copy()
     _drive(scene, rim + ABOVE, -1.0, 12)
@@ -58,7 +58,7 @@ def test_a_grip_that_misses_the_rim_leaves_the_bowl_on_the_table(offset):
 
 def test_a_gripped_bowl_hangs_level():
     scene = _scene(BOWL, 6)
-    bowl = scene.model.body("bowl/").id
+    bowl = scene.model.body("bowl_1/").id
     rim = scene.xpos[:, bowl] + (0.0, Bowl.RIM_RADIUS - 0.004, GRIP)
     for goal, gripper, steps in ((rim + ABOVE, -1, 12), (rim, -1, 9), (rim, 1, 8), (rim + ABOVE, 1, 12)):
         _drive(scene, goal, gripper, steps)
@@ -69,7 +69,7 @@ def test_a_gripped_bowl_hangs_level():
 def test_a_drawer_slides_when_pulled_stays_where_it_is_left_and_stops_at_its_end():
     model = load_task(DRAWER).build()
     data = mujoco.MjData(model)
-    joint = model.joint("cabinet/top")
+    joint = model.joint("cabinet_1/top")
     position, velocity = joint.qposadr[0], joint.dofadr[0]
     data.qfrc_applied[velocity] = -8.0
     mujoco.mj_step(model, data, 100)
@@ -82,13 +82,13 @@ def test_a_drawer_slides_when_pulled_stays_where_it_is_left_and_stops_at_its_end
     mujoco.mj_step(model, data, 400)
     assert abs(data.qpos[position] - left) < 1e-3
     for other in ("middle", "bottom"):
-        assert abs(data.qpos[model.joint(f"cabinet/{other}").qposadr[0]]) < 1e-3
+        assert abs(data.qpos[model.joint(f"cabinet_1/{other}").qposadr[0]]) < 1e-3
 
 
 @pytest.mark.parametrize("angle", [0.3, Stove.ON_ABOVE + 0.1])
 def test_the_lever_of_the_stove_stays_where_it_is_left(angle):
     scene = _scene(STOVE, 1)
-    lever = scene.model.jnt_qposadr[scene.model.joint("stove/lever").id]
+    lever = scene.model.jnt_qposadr[scene.model.joint("stove_1/lever").id]
     scene.qpos[:, lever] = angle
     for _ in range(20):
         scene.step(np.zeros((1, 7)))
@@ -97,8 +97,8 @@ def test_the_lever_of_the_stove_stays_where_it_is_left(angle):
 
 def test_the_lever_turns_only_when_its_peg_is_pushed():
     scene = _scene(STOVE, 2)
-    lever = scene.model.jnt_qposadr[scene.model.joint("stove/lever").id]
-    peg = scene.site_xpos[:, scene.model.site("stove/peg").id].copy()
+    lever = scene.model.jnt_qposadr[scene.model.joint("stove_1/lever").id]
+    peg = scene.site_xpos[:, scene.model.site("stove_1/peg").id].copy()
     aside = np.array([[-0.06, 0.0, 0.0], [-0.06, 0.0, 0.12]])  # row 1 passes above it
     _drive(scene, peg + aside + ABOVE, 1.0, 14)
     _drive(scene, peg + aside, 1.0, 8)
@@ -109,7 +109,7 @@ def test_the_lever_turns_only_when_its_peg_is_pushed():
 
 def test_fixtures_do_not_move_when_the_hand_pushes_them():
     scene = _scene(DRAWER, 2)
-    cabinet = scene.model.body("cabinet/").id
+    cabinet = scene.model.body("cabinet_1/").id
     before = scene.xpos[:, cabinet].copy()
     _drive(scene, before + (0.5 * ABOVE), 1.0, 30)
     assert np.array_equal(scene.xpos[:, cabinet], before)
@@ -119,7 +119,7 @@ def test_objects_have_the_sizes_that_scripts_and_predicates_rely_on():
     model = load_task(BOWL).build()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    bowl, plate = model.body("bowl/").id, model.body("plate/").id
+    bowl, plate = model.body("bowl_1/").id, model.body("plate_1/").id
 
     def extent(body: int, axis: int) -> tuple[float, float]:
         """Lowest and highest vertex of the body's boxes and cylinders along an axis, from its origin."""

@@ -128,7 +128,7 @@ def test_images_do_not_depend_on_the_number_of_threads():
 
 def test_the_burner_glows_in_the_rows_where_the_stove_is_on():
     scene = make("starter/turn_on_the_stove", 2, cameras=("agentview",))
-    joint = scene.model.jnt_qposadr[scene.model.joint("stove/lever").id]
+    joint = scene.model.jnt_qposadr[scene.model.joint("stove_1/lever").id]
     state = scene.sim_state()
     scene.qpos[1, joint] = 1.4
     lit = scene.sim_state()

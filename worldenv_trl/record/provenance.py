@@ -149,7 +149,6 @@ def _calibration(task: Task, size_px: int) -> dict[str, Any]:
 def _scene_files(task: Task) -> dict[str, bytes]:
     import mujoco
 
-    from worldenv_trl.scenes import starter
     from worldenv_trl.scenes.files import FileTask
     from worldenv_trl.scenes.settings import compile_scene
 
@@ -157,14 +156,14 @@ def _scene_files(task: Task) -> dict[str, bytes]:
     compiled = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, compiled)
     files = {"mjb": compiled.tobytes()}
+    if not isinstance(task, FileTask):
+        return files
     with tempfile.TemporaryDirectory() as folder:
         # MuJoCo writes the text of the model that it compiled last, and tasks keep theirs: compile it once more.
-        fresh = compile_scene(task.problem)[1] if isinstance(task, FileTask) else starter._build.__wrapped__(task)
         path = Path(folder) / "scene.xml"
-        mujoco.mj_saveLastXML(str(path), fresh)
+        mujoco.mj_saveLastXML(str(path), compile_scene(task.problem)[1])
         files["mjcf"] = path.read_bytes()
-    if isinstance(task, FileTask):
-        files["bddl"] = Path(task.problem.source).read_bytes()
+    files["bddl"] = Path(task.problem.source).read_bytes()
     return files
 
 

@@ -6,33 +6,29 @@ import difflib
 from functools import cache
 from pathlib import Path
 
-from worldenv_trl.scenes.files import load_bddl
-from worldenv_trl.scenes.starter import STARTER_TASKS
-from worldenv_trl.scenes.starter import SUITE as STARTER
-from worldenv_trl.scenes.tasks import Task
+from worldenv_trl.scenes.files import FileTask, load_bddl
 
 __all__ = ["SUITES_FOLDER", "list_suites", "list_tasks", "load_task"]
 
 SUITES_FOLDER = Path(__file__).parent / "suites"
-_MAX_STEPS = {"spatial": 120, "object": 120, "goal": 150, "long": 260}  # half as long again as the expert's slow ones
-_FIRST_ID = 100
+STARTER = "starter"
+_MAX_STEPS = {STARTER: 72, "spatial": 120, "object": 120, "goal": 150, "long": 260}
+_FIRST_ID = {STARTER: 0, "spatial": 100, "object": 110, "goal": 120, "long": 130}
 
 
 def list_suites() -> list[str]:
     """Names of the benchmark's suites; the three ``starter`` tasks of the recipes' presets stand beside them."""
-    return list(_MAX_STEPS)
+    return [suite for suite in _MAX_STEPS if suite != STARTER]
 
 
 def list_tasks(suite: str) -> list[str]:
     """Names of a suite's tasks, in the order of their ``task_id``; raises ``ValueError`` for an unknown suite."""
-    if suite == STARTER:
-        return [task.name for task in STARTER_TASKS]
     if suite not in _MAX_STEPS:
-        raise ValueError(f"unknown suite {suite!r}: it must be one of {', '.join([*_MAX_STEPS, STARTER])}")
+        raise ValueError(f"unknown suite {suite!r}: it must be one of {', '.join([*list_suites(), STARTER])}")
     return [f"{suite}/{path.stem}" for path in sorted((SUITES_FOLDER / suite).glob("*.bddl"))]
 
 
-def load_task(name: str | Path) -> Task:
+def load_task(name: str | Path) -> FileTask:
     """The task called ``suite/name``, or that of a file ``path.bddl``.
 
     Raises:
@@ -50,20 +46,18 @@ def load_task(name: str | Path) -> Task:
 
 @cache
 def _known() -> tuple[str, ...]:
-    return tuple(name for suite in (*_MAX_STEPS, STARTER) for name in list_tasks(suite))
+    return tuple(name for suite in _MAX_STEPS for name in list_tasks(suite))
 
 
 @cache
-def _load(name: str) -> Task:
+def _load(name: str) -> FileTask:
     suite, stem = name.split("/")
-    if suite == STARTER:
-        return next(task for task in STARTER_TASKS if task.name == name)
     path = SUITES_FOLDER / suite / f"{stem}.bddl"
     return load_bddl(
         path,
         name=name,
         suite=suite,
-        task_id=_FIRST_ID + _known().index(name),
+        task_id=_FIRST_ID[suite] + list_tasks(suite).index(name),
         max_steps=_MAX_STEPS[suite],
         states=path.with_suffix(".npz"),
     )

@@ -5,17 +5,20 @@ Each step it looks at the true state again, so actions disturbed from outside ar
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
+from itertools import accumulate
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from worldenv_trl.keys import ACTION_DIM, POSITION_STEP, ROTATION_STEP
 from worldenv_trl.scenes import controller
+from worldenv_trl.scenes.catalogue import load_task
 from worldenv_trl.scenes.files import FileTask
-from worldenv_trl.scenes.plan import Stage, plan_stages
+from worldenv_trl.scenes.plan import plan_stages
 from worldenv_trl.scenes.skills.phase import nearest_yaw
-from worldenv_trl.scenes.skills.starter import SCRIPTS
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.simulation import SceneBatch
@@ -31,26 +34,26 @@ class ScriptedExpert:
     """Solves one task; ``expert(scene)`` gives normalised actions ``[n, 7]``.
 
     Args:
-        task: a starter task, or a task of a file.
+        task: a task of a file, or its name or path.
 
     Keyword Args:
-        goal: what to do instead of the task's goal, in the same form; file tasks only.
+        goal: what to do instead of the task's goal, in the same form.
 
     Raises:
-        ValueError: for a goal that its skills cannot reach.
+        ValueError: for a goal that its skills cannot reach, and a task that no file describes.
     """
 
-    def __init__(self, task: Task, *, goal: Sequence[tuple[str, ...]] | None = None) -> None:
-        goal = task.goal if goal is None else tuple(goal)
-        self._stages: list[Stage] = []
-        if isinstance(task, FileTask):
-            self._stages = plan_stages(task, goal)
-            self._relations = task.relations
-            self.phases = [phase for stage in self._stages for phase in stage.phases]
-        elif len(goal) == 1 and goal[0][0] in SCRIPTS:
-            self.phases = SCRIPTS[goal[0][0]](*goal[0][1:])
-        else:
-            raise ValueError(f"no script for {task.name}: its goal is {goal}, scripts exist for {', '.join(SCRIPTS)}")
+    def __init__(self, task: Task | str | Path, *, goal: Sequence[tuple[str, ...]] | None = None) -> None:
+        if isinstance(task, str | Path):
+            task = load_task(task)
+        if not isinstance(task, FileTask):
+            raise ValueError(
+                f"no script for {task.name}: the expert plans from a task file (load_task), not from a class"
+            )
+        self.task, self._relations = task, task.relations
+        self._stages = plan_stages(task, task.goal if goal is None else goal)
+        self._ends = list(accumulate(len(stage.phases) for stage in self._stages))
+        self.phases = [phase for stage in self._stages for phase in stage.phases]
         self.phase: np.ndarray | None = None
 
     def reset(self, rows: np.ndarray | None = None) -> None:
@@ -125,34 +128,22 @@ class ScriptedExpert:
         wanted[:, 2, 2] = -1.0
         return controller.vector_from_rotation(wanted @ commanded.swapaxes(1, 2))
 
-    def _stage(self, index: int) -> tuple[Stage | None, int]:
-        """The stage that a phase belongs to, and the first phase after it."""
-        end = 0
-        for stage in self._stages:
-            end += len(stage.phases)
-            if index < end:
-                return stage, end
-        return None, len(self.phases)
-
     def _done(self, scene: SceneBatch, index: int) -> np.ndarray:
         """``[n]``: what the phase's stage is for holds already."""
-        stage, _ = self._stage(index)
-        return np.zeros(scene.num_envs, bool) if stage is None else self._relations.evaluate(scene, *stage.aim)
+        return self._relations.evaluate(scene, *self._stages[bisect_right(self._ends, index)].aim)
 
     def _let_go(self, index: int) -> int:
         """The last but one phase of the same stage: the hand opens and leaves."""
-        return max(index, self._stage(index)[1] - 2)
+        return max(index, self._ends[bisect_right(self._ends, index)] - 2)
 
     def _again(self, scene: SceneBatch, rows: np.ndarray, following: np.ndarray) -> np.ndarray:
         """Sends those of ``rows`` that have waited at the end back to the first stage whose aim does not hold."""
         waited = rows & (self._spent >= _PATIENCE)
-        if not waited.any() or not self._stages:
-            return np.zeros_like(rows)
-        open_ = waited.copy()
-        start = 0
-        for stage in self._stages:
-            failed = open_ & ~self._relations.evaluate(scene, *stage.aim)
+        if not waited.any():
+            return waited
+        left = waited.copy()
+        for stage, start in zip(self._stages, (0, *self._ends), strict=False):
+            failed = left & ~self._relations.evaluate(scene, *stage.aim)
             following[failed] = start
-            open_ &= ~failed
-            start += len(stage.phases)
+            left &= ~failed
         return waited

@@ -30,7 +30,8 @@ _FIRST_ID, _IDS = 1000, 9000
 class FileTask(Task):
     """A task whose scene, initial states and goal come from a file.
 
-    ``digest`` is the checksum of the file's text, ``states`` the file of stored initial states, if there is one.
+    ``digest`` is the checksum of the file's text, and the seed of its initial states, which so stay the same when the
+    catalogue is numbered anew; ``states`` is the file of stored ones, if there is one.
     """
 
     digest: int = 0
@@ -54,11 +55,6 @@ class FileTask(Task):
     def relations(self) -> Relations:
         """What judges the goal."""
         return _relations(self)
-
-    @property
-    def seed(self) -> int:
-        """Of the initial states: they stay the same when the catalogue is numbered anew."""
-        return self.digest
 
     def evaluate(self, scene: SceneBatch) -> np.ndarray:
         return self.relations.holds(scene)

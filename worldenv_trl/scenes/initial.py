@@ -33,7 +33,7 @@ def draw_poses(task: FileTask, split: str, start: int, count: int) -> np.ndarray
         RuntimeError: if things cannot be placed clear of each other, or do not come to rest where they were placed.
     """
     model = task.build()
-    things = np.array([model.body(f"{name}/").id for name in task.problem.objects])
+    things = np.array([model.body(f"{name}/").id for name in task.problem.objects], int)
     scene = SceneBatch(task, count, cameras=())
     data = mujoco.MjData(model)
     qpos, ctrl, targets = home_state(model, panda.HOME_Q)
@@ -43,7 +43,7 @@ def draw_poses(task: FileTask, split: str, start: int, count: int) -> np.ndarray
         drawn = np.zeros((len(waiting), len(things), 3))
         for row, index in enumerate(waiting):
             # One generator per state and attempt: a larger count extends a smaller one.
-            rng = np.random.default_rng([task.seed, SPLITS.index(split), start + int(index), attempt])
+            rng = np.random.default_rng([task.digest, SPLITS.index(split), start + int(index), attempt])
             data.qpos[:] = qpos
             task.layout.draw(data, rng)
             mujoco.mj_kinematics(model, data)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from worldenv_trl.keys import ACTION_DIM
 from worldenv_trl.scenes.expert import ScriptedExpert
-from worldenv_trl.scenes.files import FileTask
 from worldenv_trl.scenes.skills import OPEN
 
 if TYPE_CHECKING:
+    from worldenv_trl.scenes.files import FileTask
     from worldenv_trl.scenes.simulation import SceneBatch
     from worldenv_trl.scenes.tasks import Task
 
@@ -28,7 +29,7 @@ class PerturbedExpert:
     Each row draws its own mishaps when it is reset, from ``(seed, row, number of the episode)`` alone.
 
     Args:
-        task: any task with a script.
+        task: a task of a file, or its name or path.
 
     Keyword Args:
         noise: standard deviation of what is added to every action.
@@ -44,7 +45,7 @@ class PerturbedExpert:
 
     def __init__(
         self,
-        task: Task,
+        task: Task | str | Path,
         *,
         noise: float = 0.0,
         gripper_flips: float = 0.0,
@@ -61,7 +62,7 @@ class PerturbedExpert:
         self.noise, self.gripper_flips, self.early_release = noise, gripper_flips, early_release
         self.wrong_object, self.seed = wrong_object, seed
         self._right = ScriptedExpert(task)
-        self._wrong = ScriptedExpert(task, goal=_wrong_goal(task)) if wrong_object else None
+        self._wrong = ScriptedExpert(task, goal=_wrong_goal(self._right.task)) if wrong_object else None
         self._rngs: list[np.random.Generator] = []
 
     def reset(self, rows: np.ndarray | None = None) -> None:
@@ -118,12 +119,11 @@ class PerturbedExpert:
         action[:6] += self.noise * rng.standard_normal(ACTION_DIM - 1)
 
 
-def _wrong_goal(task: Task) -> list[tuple[str, ...]]:
+def _wrong_goal(task: FileTask) -> list[tuple[str, ...]]:
     """The goal with another thing in the place of the first that is to be moved."""
-    if isinstance(task, FileTask):
-        asked = {aim[1] for aim in task.goal if aim[0] in ("On", "In")} | {aim[2] for aim in task.goal if len(aim) > 2}
-        others = [name for name, entity in task.entities.items() if entity.grasp is not None and name not in asked]
-        for index, aim in enumerate(task.goal):
-            if aim[0] in ("On", "In") and others:
-                return [*task.goal[:index], (aim[0], others[0], *aim[2:]), *task.goal[index + 1 :]]
+    asked = {aim[1] for aim in task.goal if aim[0] in ("On", "In")} | {aim[2] for aim in task.goal if len(aim) > 2}
+    others = [name for name, entity in task.entities.items() if entity.grasp is not None and name not in asked]
+    for index, aim in enumerate(task.goal):
+        if aim[0] in ("On", "In") and others:
+            return [*task.goal[:index], (aim[0], others[0], *aim[2:]), *task.goal[index + 1 :]]
     raise ValueError(f"{task.name} has nothing that could be put in the wrong thing's place: wrong_object must be 0")

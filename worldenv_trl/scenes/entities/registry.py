@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from worldenv_trl.scenes.entities.base import Primitive
-from worldenv_trl.scenes.entities.cookware import FryingPan, MokaPot, WideStove
+from worldenv_trl.scenes.entities.cookware import FryingPan, MokaPot, Stove, WideStove
 from worldenv_trl.scenes.entities.groceries import Book, Bottle, Can, Carton, Packet
 from worldenv_trl.scenes.entities.storage import Basket, Cabinet, Caddy, DeepCabinet, Microwave, Rack, Shelf
 from worldenv_trl.scenes.entities.tableware import Bowl, Mug, Plate, Ramekin
@@ -45,6 +45,7 @@ CATEGORIES: Mapping[str, Category] = MappingProxyType(
         "white_bowl": _as(Bowl, outside=(0.92, 0.92, 0.93, 1), inside=(0.70, 0.72, 0.76, 1)),
         "red_bowl": _as(Bowl, outside=(0.78, 0.12, 0.10, 1), inside=(0.45, 0.06, 0.05, 1)),
         "plate": _as(Plate, scale=0.72),
+        "dinner_plate": _as(Plate),
         "glazed_rim_porcelain_ramekin": _as(Ramekin),
         "porcelain_mug": _as(Mug),
         "red_coffee_mug": _as(Mug, outside=(0.82, 0.12, 0.10, 1), inside=(0.40, 0.22, 0.12, 1)),
@@ -74,6 +75,7 @@ CATEGORIES: Mapping[str, Category] = MappingProxyType(
         "chefmate_8_frypan": _as(FryingPan),
         "moka_pot": _as(MokaPot),
         "flat_stove": _as(WideStove),
+        "stove": _as(Stove),
         # storage
         "cabinet": _as(Cabinet),
         "wooden_cabinet": _as(DeepCabinet, yaw=math.pi),
