@@ -7,6 +7,7 @@ from dm_control import composer, mjcf
 from worldenv_trl.scenes import panda
 from worldenv_trl.scenes.camera import Camera, look_at
 from worldenv_trl.scenes.entities.base import Color
+from worldenv_trl.scenes.materials import GRAIN, PLASTER, Material
 
 AGENTVIEW = look_at("agentview", (0.78, 0.0, 0.60), (-0.03, 0.0, 0.105), 31.0)
 
@@ -24,6 +25,8 @@ class TabletopArena:
         *,
         table: Color = (0.72, 0.70, 0.66, 1),
         wall: Color = (0.45, 0.52, 0.50, 1),
+        table_material: Material = GRAIN,
+        wall_material: Material = PLASTER,
     ) -> None:
         self.root = root = mjcf.RootElement(model="scene")
         root.compiler.angle = "radian"
@@ -45,17 +48,19 @@ class TabletopArena:
         )
         root.worldbody.add(
             "geom", name="table", type="box", pos=(0, 0, -0.02), size=(0.5, 0.7, 0.02), rgba=table,
-            friction=(1.0, 0.01, 0.0005), condim=4,
+            friction=(1.0, 0.01, 0.0005), condim=4, **table_material.of(root),
         )  # fmt: skip
         root.worldbody.add(
             "geom",
             name="wall",
             type="box",
             pos=(-1.2, 0, 0),
-            size=(0.02, 3, 3),
+            xyaxes=(0, 1, 0, 0, 0, 1),  # its z axis, along which the pattern is projected, points at the robot
+            size=(3, 3, 0.02),
             rgba=wall,
             contype=0,
             conaffinity=0,
+            **wall_material.of(root),
         )
         for camera in cameras:
             root.worldbody.add("camera", name=camera.name, pos=camera.position, xyaxes=camera.axes, fovy=camera.fovy)

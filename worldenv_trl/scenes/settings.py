@@ -16,6 +16,7 @@ from worldenv_trl.scenes.camera import Camera, look_at
 from worldenv_trl.scenes.entities import Primitive, make_entity
 from worldenv_trl.scenes.entities.base import Color
 from worldenv_trl.scenes.entities.registry import WORKSPACES
+from worldenv_trl.scenes.materials import BOARDS, GRAIN, PARQUET, PLASTER, TILES, WALL_TILES, WALLPAPER, Material
 
 __all__ = ["SETTINGS", "Setting", "compile_scene", "part_of", "setting_of"]
 
@@ -26,7 +27,7 @@ CONTACT = (0.01, 4)
 
 @dataclass(frozen=True)
 class Setting:
-    """Colours and camera, and where the workspace's (0, 0) lies on our table.
+    """Colours, materials and camera, and where the workspace's (0, 0) lies on our table.
 
     The robot stands at the same place in all of them; LIBERO's workspaces begin at other distances from it.
     """
@@ -35,6 +36,8 @@ class Setting:
     table: Color
     wall: Color
     camera: Camera
+    table_material: Material = GRAIN
+    wall_material: Material = PLASTER
 
     @property
     def origin(self) -> tuple[float, float]:
@@ -43,10 +46,10 @@ class Setting:
 
 _WIDE = look_at("agentview", (0.86, 0.0, 0.80), (-0.09, 0.0, 0.05), 36.0)
 _TABLETOP = Setting(0.66, (0.72, 0.70, 0.66, 1), (0.45, 0.52, 0.50, 1), _WIDE)
-_KITCHEN = Setting(0.66, (0.62, 0.64, 0.60, 1), (0.78, 0.70, 0.48, 1), _WIDE)
-_LIVING_ROOM = Setting(0.51, (0.55, 0.42, 0.32, 1), (0.62, 0.60, 0.64, 1), _WIDE)
-_STUDY = Setting(0.55, (0.66, 0.58, 0.48, 1), (0.40, 0.44, 0.55, 1), _WIDE)
-_FLOOR = Setting(0.60, (0.60, 0.62, 0.64, 1), (0.50, 0.46, 0.42, 1), _WIDE)
+_KITCHEN = Setting(0.66, (0.62, 0.64, 0.60, 1), (0.78, 0.70, 0.48, 1), _WIDE, TILES, WALL_TILES)
+_LIVING_ROOM = Setting(0.51, (0.55, 0.42, 0.32, 1), (0.62, 0.60, 0.64, 1), _WIDE, BOARDS, WALLPAPER)
+_STUDY = Setting(0.55, (0.66, 0.58, 0.48, 1), (0.40, 0.44, 0.55, 1), _WIDE, GRAIN, PLASTER)
+_FLOOR = Setting(0.60, (0.60, 0.62, 0.64, 1), (0.50, 0.46, 0.42, 1), _WIDE, PARQUET, PLASTER)
 
 _BENCH = Setting(-panda.BASE_POSITION[0], (0.72, 0.70, 0.66, 1), (0.45, 0.52, 0.50, 1), AGENTVIEW)
 
@@ -86,7 +89,13 @@ def compile_scene(problem: Problem) -> tuple[dict[str, Primitive], mujoco.MjMode
         ValueError: for an unknown problem class or category, naming the file.
     """
     setting = setting_of(problem)
-    arena = TabletopArena((setting.camera,), table=setting.table, wall=setting.wall)
+    arena = TabletopArena(
+        (setting.camera,),
+        table=setting.table,
+        wall=setting.wall,
+        table_material=setting.table_material,
+        wall_material=setting.wall_material,
+    )
     entities: dict[str, Primitive] = {}
     for named, add in ((problem.fixtures, arena.add_fixture), (problem.objects, arena.add_object)):
         for name, category in named.items():

@@ -9,6 +9,7 @@ import numpy as np
 from dm_control import mjcf
 
 from worldenv_trl.scenes.entities.base import GHOST, Grasp, JointState, Primitive
+from worldenv_trl.scenes.materials import WORN
 
 
 class FryingPan(Primitive):
@@ -19,7 +20,7 @@ class FryingPan(Primitive):
     grasp = Grasp((0.125, 0.0, 0.030))
 
     def _shape(self, body: mjcf.Element) -> None:
-        iron, inside = {"rgba": (0.16, 0.16, 0.18, 1)}, {"rgba": (0.42, 0.43, 0.46, 1)}
+        iron, inside = {"rgba": (0.16, 0.16, 0.18, 1)}, {"rgba": (0.46, 0.47, 0.50, 1), **WORN.of(self._root)}
         self._disc(body, 0.078, 0.0, 0.006, mass=0.20, **iron)
         self._disc(body, 0.070, 0.0005, 0.0066, **GHOST, **inside)
         self._ring(body, 0.076, 0.083, 0.0, 0.035, mass=0.008, **iron)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dm_control import mjcf
 
 from worldenv_trl.scenes.entities.base import GHOST, Color, Grasp, Primitive
+from worldenv_trl.scenes.materials import PAGES
 
 WHITE: Color = (0.95, 0.95, 0.95, 1)
 
@@ -100,7 +101,8 @@ class Book(Primitive):
 
     def _shape(self, body: mjcf.Element, cover: Color = (0.10, 0.10, 0.13, 1)) -> None:
         x, y, z = self.WIDTH / 2, self.THICKNESS / 2, self.height / 2
+        paper = {"rgba": (0.95, 0.92, 0.82, 1), **PAGES.of(self._root)}
         self._box(body, (0, 0, z), (x, y, z), mass=0.10, rgba=cover)
-        self._box(body, (0.0015, 0, z + 0.0006), (x, y - 0.004, z), **GHOST, rgba=(0.93, 0.9, 0.8, 1))
+        self._box(body, (0.0015, 0, z + 0.0006), (x, y - 0.004, z), **GHOST, **paper)
         self._box(body, (0, 0, 1.4 * z), (0.6 * x, y + 0.0006, 0.012), **GHOST, rgba=(0.85, 0.7, 0.2, 1))
         self._mark(body, "center", (0, 0, 0))

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from dm_control import mjcf
 
 from worldenv_trl.scenes.entities.base import GHOST, Color, JointState, Primitive
+from worldenv_trl.scenes.materials import WICKER
 
 _WOOD: Color = (0.50, 0.30, 0.16, 1)
 
@@ -148,7 +149,7 @@ class Basket(Primitive):
 
     def _shape(self, body: mjcf.Element) -> None:
         x, y = self.HALF
-        weave, floor = {"rgba": (0.72, 0.52, 0.28, 1)}, {"rgba": (0.52, 0.36, 0.20, 1)}
+        weave, floor = {"rgba": (0.80, 0.58, 0.31, 1), **WICKER.of(self._root)}, {"rgba": (0.52, 0.36, 0.20, 1)}
         self._box(body, (0, 0, 0.004), (x, y, 0.004), mass=0.6, **floor)
         for side in (-1, 1):
             self._box(body, (side * (x - 0.004), 0, 0.045), (0.004, y, 0.045), mass=0.1, **weave)
