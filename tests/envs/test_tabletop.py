@@ -25,7 +25,7 @@ from worldenv_trl.keys import (
 from worldenv_trl.scenes import list_tasks, load_task
 
 TASKS = list_tasks("starter")
-BOWL, DRAWER, STOVE = TASKS
+DRAWER, BOWL, STOVE = TASKS
 SHOWN = (IMAGE, STATE, KINEMATIC_STATE, NUM_STEPS, SUCCESS, CONTEXT_ID, SIM_STATE, "reward", "done", "truncated")
 
 

@@ -189,7 +189,7 @@ def test_provenance_says_what_a_replay_needs(tmp_path):
     model = torch.nn.Linear(3, 2)
     described = provenance(env, models={"policy": model}, config={"lr": (1, 2)}, stage="test")
     metadata = described["metadata"]
-    assert metadata["tasks"] == TASKS and metadata["task_ids"] == [1, 2] and metadata["stage"] == "test"
+    assert metadata["tasks"] == TASKS and metadata["task_ids"] == [0, 2] and metadata["stage"] == "test"
     assert metadata["env"]["seed"] == 0 and metadata["env"]["max_steps"] == 6 and metadata["config"] == {"lr": [1, 2]}
     assert metadata["models"]["policy"] == model_hash(model)
     camera = metadata["calibration"][TASKS[0]]["agentview"]

@@ -11,7 +11,8 @@ from worldenv_trl.scenes.entities import CATEGORIES, make_entity
 from worldenv_trl.scenes.entities.registry import WORKSPACES
 
 FIXTURES = (
-    "flat_stove", "cabinet", "wooden_cabinet", "white_cabinet", "microwave", "desk_caddy", "wine_rack",
+    "flat_stove",
+    "stove", "cabinet", "wooden_cabinet", "white_cabinet", "microwave", "desk_caddy", "wine_rack",
     "wooden_two_layer_shelf",
 )  # fmt: skip
 MOVABLE = [name for name in CATEGORIES if name not in FIXTURES]
