@@ -7,14 +7,20 @@ processes share the work, each on one thread.
 from __future__ import annotations
 
 import multiprocessing
+import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import tyro
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the recipes beside this folder
+
+from refusal import at_least, one_line_errors
+from task_names import SUITES, named_tasks
 from worldenv_trl.metrics import wilson_interval
-from worldenv_trl.scenes import SceneBatch, ScriptedExpert, list_suites, list_tasks, load_task
+from worldenv_trl.scenes import SceneBatch, ScriptedExpert, list_suites, load_task
 from worldenv_trl.scenes.tasks import SPLITS
 
 
@@ -30,9 +36,13 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    suites = [*list_suites(), "starter"]
-    wanted = settings.tasks or list_suites()
-    tasks = [task for name in wanted for task in (list_tasks(name) if name in suites else [name])]
+    with one_line_errors():
+        at_least(1, count=settings.count, processes=settings.processes)
+        tasks = named_tasks(settings.tasks or list_suites())
+        for name in settings.tasks:
+            if name not in SUITES:
+                task = load_task(name)
+                ScriptedExpert(task), task.init_states("train", 1)
     start = time.perf_counter()
     with multiprocessing.get_context("spawn").Pool(settings.processes) as pool:
         results = pool.starmap(count_successes, [(name, settings.count) for name in tasks], chunksize=1)

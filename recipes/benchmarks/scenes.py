@@ -14,7 +14,10 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the recipes beside this folder
 
 import mujoco
 import torch
@@ -22,10 +25,13 @@ import tyro
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
+from refusal import at_least, one_line_errors
+from task_names import SUITES, named_tasks
 from worldenv_trl.envs import ExpertPolicy, TabletopEnv
 from worldenv_trl.keys import ACTION, ACTION_DIM, NUM_STEPS
-from worldenv_trl.scenes import Task, list_suites, list_tasks, load_task
+from worldenv_trl.scenes import ScriptedExpert, Task, list_tasks, load_task
 
+_STANDARD = tuple(name for suite in SUITES for name in list_tasks(suite))
 _LONGEST = 64  # steps that are recorded
 
 
@@ -57,14 +63,6 @@ class _Replay(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.step += 1
         return tensordict.set(ACTION, self.actions[(self.step - 1) % len(self.actions)])
-
-
-def named_tasks(names: tuple[str, ...]) -> list[Task]:
-    """The tasks that suites, tasks and files mean, each once."""
-    wanted: list[str] = []
-    for name in names:
-        wanted += list_tasks(name) if name in (*list_suites(), "starter") else [name]
-    return [load_task(name) for name in dict.fromkeys(wanted)]
 
 
 def make(tasks: list[Task], rows: int, threads: int, size: int = 64, cameras: tuple[str, ...] = ()) -> TabletopEnv:
@@ -120,7 +118,22 @@ def shown(values: list[float]) -> str:
     return f"{statistics.median(values):>8.0f} [{min(values):.0f}, {max(values):.0f}]"
 
 
+def check(settings: Benchmark) -> None:
+    """Raises before anything is measured."""
+    at_least(16, image_sizes=settings.image_sizes)
+    at_least(1, rows=settings.rows, threads=settings.threads, repeats=settings.repeats)
+    if settings.seconds <= 0:
+        raise ValueError(f"--seconds must be positive, got {settings.seconds}")
+    for name in named_tasks(settings.tasks):
+        if name not in _STANDARD:  # those are fine, and what it takes to load them is measured
+            load_task(name).init_states("train", 1)
+        if settings.actions == "expert":
+            ScriptedExpert(load_task(name))
+
+
 def main(settings: Benchmark) -> None:
+    with one_line_errors():
+        check(settings)
     sizes, rows = settings.image_sizes, settings.rows
     if settings.quick:
         settings = Benchmark(settings.tasks, threads=settings.threads, actions=settings.actions, repeats=2, seconds=0.2)
@@ -132,7 +145,7 @@ def main(settings: Benchmark) -> None:
         print("the machine is busy with something else: figures will be too low, those of several threads most of all")
 
     before, started = resident(), time.perf_counter()
-    tasks = named_tasks(settings.tasks)
+    tasks = [load_task(name) for name in named_tasks(settings.tasks)]
     for task in tasks:
         task.build()
     total, used = time.perf_counter() - started, resident() - before

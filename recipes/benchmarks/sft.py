@@ -18,7 +18,8 @@ import demonstrate
 import sft
 from config import SFT, WorldEnvConfig
 from outcomes import physics_outcomes
-from parts import load_policy, seed_everything
+from parts import check_config, load_policy, seed_everything
+from refusal import at_least, one_line_errors
 from run_folder import RunFolder
 from worldenv_trl.metrics import wilson_interval
 from worldenv_trl.policies import laplace_actor
@@ -39,7 +40,9 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    tasks = tuple(list_tasks(settings.suite))
+    with one_line_errors():
+        at_least(1, episodes_per_task=settings.episodes_per_task)
+        tasks = tuple(list_tasks(settings.suite))
     steps = 8 * -(-load_task(tasks[0]).max_steps // 8)  # whole chunks
     config = WorldEnvConfig(
         run_dir=settings.run_dir,
@@ -49,8 +52,10 @@ def main(settings: Settings) -> None:
         max_steps=steps,
         sft=settings.sft,
     )
-    folder = RunFolder(config.run_dir)
-    folder.open(config)
+    with one_line_errors():
+        check_config(config)
+        folder = RunFolder(config.run_dir)
+        folder.open(config)
     demonstrate.run(config, folder)
     sft.run(config, folder)
     seed_everything(config, offset=90)

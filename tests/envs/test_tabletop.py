@@ -23,6 +23,7 @@ from worldenv_trl.keys import (
     WRIST_IMAGE,
 )
 from worldenv_trl.scenes import list_tasks, load_task
+from worldenv_trl.scenes.catalogue import SUITES_FOLDER
 
 TASKS = list_tasks("starter")
 DRAWER, BOWL, STOVE = TASKS
@@ -311,14 +312,23 @@ def test_actions_are_clipped():
         ([], {}, "task is empty"),
         ([DRAWER, DRAWER], {}, "named twice"),
         (TASKS, {}, "3 tasks need at least 3 rows, got num_envs=2"),
-        (DRAWER, {"n": 0}, "got 0"),
+        (DRAWER, {"n": 0}, "num_envs must be a whole number of at least 1, got 0"),
+        (DRAWER, {"n": 2.0}, "num_envs must be a whole number of at least 1, got 2.0"),
+        (DRAWER, {"group_repeats": 0}, "group_repeats must be a whole number of at least 1, got 0"),
+        (DRAWER, {"seed": -1}, "seed must be a whole number of at least 0, got -1"),
+        (DRAWER, {"seed": 1.5}, "seed must be a whole number of at least 0, got 1.5"),
+        (DRAWER, {"seed": "1"}, "seed must be a whole number of at least 0, got '1'"),
+        (DRAWER, {"init_state_id": -1}, "init_state_id must be a whole number of at least 0, got -1"),
+        (DRAWER, {"init_state_id": 0.5}, "init_state_id must be a whole number of at least 0, got 0.5"),
+        (DRAWER, {"init_state_count": 0}, "init_state_count must be a whole number of at least 1, got 0"),
+        (DRAWER, {"num_threads": 0}, "num_threads must be a whole number of at least 1, got 0"),
         (DRAWER, {"group_repeats": 3}, "multiple of group_repeats, got 2 and 3"),
         (DRAWER, {"image_size": 8}, "at least 16 px, got 8"),
         (DRAWER, {"cameras": ("front",)}, "unknown camera 'front'"),
         (DRAWER, {"init_split": "val"}, "unknown split 'val'"),
         (DRAWER, {"init_state_mode": "next"}, "got 'next'"),
         (DRAWER, {"init_state_id": 50, "init_state_mode": "cycle"}, r"\[0, 50\), got 50"),
-        (DRAWER, {"max_steps": 0}, "got 0"),
+        (DRAWER, {"max_steps": 0}, "max_steps must be a whole number of at least 1, got 0"),
         (DRAWER, {"proprio": "true"}, "got 'true'"),
         (DRAWER, {"context_ids": [1]}, "pass both or neither"),
     ],
@@ -326,6 +336,20 @@ def test_actions_are_clipped():
 def test_settings_that_cannot_be_are_refused(task, options, message):
     with pytest.raises(ValueError, match=message):
         make(task, **options)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, True])
+def test_a_seed_that_cannot_be_is_refused_and_the_old_one_stays(seed):
+    env, other = make(DRAWER, 4, cameras=()), make(DRAWER, 4, cameras=())
+    with pytest.raises(ValueError, match=f"seed must be a whole number of at least 0, got {seed}"):
+        env.set_seed(seed)
+    assert torch.equal(ids(env, 2), ids(other, 2))
+
+
+def test_a_file_s_path_is_a_task():
+    path = SUITES_FOLDER / "goal" / "open_the_top_drawer.bddl"
+    env = make(path, cameras=())
+    assert [task.language for task in env.tasks] == [load_task("goal/open_the_top_drawer").language]
 
 
 @pytest.mark.parametrize(

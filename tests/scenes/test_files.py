@@ -12,7 +12,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 from worldenv_trl.envs import TabletopEnv
-from worldenv_trl.scenes import SceneBatch, ScriptedExpert, load_task
+from worldenv_trl.scenes import SceneBatch, ScriptedExpert, initial, load_task
 
 TEXT = """
 (define (problem tabletop) (:domain robosuite) (:language put the bowl on the plate and the soup in the basket)
@@ -107,23 +107,45 @@ def test_a_goal_without_a_script_is_refused(path):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("old", "new", "line", "message"),
     [
-        ("(On bowl_1 plate_1)", "(Open plate_1)", r"two_things.bddl: \(Open plate_1\) in :goal: it has no such joint"),
-        ("(contain_region (:target basket_1))", "(contain_region (:target plate_1))", "region"),
-        ("(In soup_1 basket_1_contain_region)", "(In basket_1_contain_region soup_1)", "not a thing"),
+        ("(On bowl_1 plate_1)", "(Open plate_1)", 13, "plate_1 has no joint for Open"),
+        ("(On bowl_1 plate_1)", "(Open table_1)", 13, "table_1 has no joint for Open"),
+        ("(On bowl_1 plate_1)", "(On bowl_1 table_1)", 13, "table_1 is the workspace: name one of its regions"),
+        ("(On bowl_1 plate_1)", "(On bowl_1 bowl_1)", 13, "cannot be put on or into itself"),
+        ("(On bowl_1 plate_1)", "(In bowl_1 plate_1)", 13, "plate_1 has no contain_region: did you mean On"),
+        ("(On bowl_1 plate_1)", "(In bowl_1 table_1_far_region)", 13, "is flat: nothing is in it, say On"),
+        ("(contain_region (:target basket_1))", "(contain_region (:target plate_1))", 13, "'plate_1_contain_region'"),
+        ("(In soup_1 basket_1_contain_region)", "(In basket_1_contain_region soup_1)", 13, "is not a thing"),
+        ("0.10 -0.10 0.14 -0.06", "0.02 0.20 0.04 0.22", 7, "soup_1 cannot be placed in it clear of basket_1"),
         (
             "0.10 -0.10 0.14 -0.06",
-            "0.02 0.20 0.04 0.22",
-            "(soup|basket)_1 cannot be placed in table_1_(near|far)_region",
+            "10 -10 14 -6",
+            7,
+            r"\(10 -10 14 -6\) lies off the table: x = 10 is not in \[-0.56, 0",
         ),
     ],
 )
-def test_what_cannot_be_laid_out_or_judged_is_refused_with_the_file_s_name(path, old, new, message):
+def test_what_cannot_be_laid_out_or_judged_is_refused_with_file_and_line(path, old, new, line, message):
     assert old in TEXT
     path.write_text(TEXT.replace(old, new))
-    with pytest.raises((ValueError, RuntimeError), match=message):
-        load_task(path).init_states("train", 1)
+    with pytest.raises((ValueError, RuntimeError), match=rf"two_things\.bddl:{line}: .*{message}"):
+        load_task(path).init_states("train", 50)
+
+
+def test_what_never_comes_to_rest_is_refused_after_few_draws(path, monkeypatch):
+    monkeypatch.setattr(initial, "_MOVED", 1e-9)  # as if everything fell
+    message = r"two_things\.bddl:1[12]: '\(On (\w+) \w+\)': \1 does not come to rest there in any of 100 draws"
+    with pytest.raises(RuntimeError, match=message):
+        load_task(path).init_states("train", 50)
+
+
+def test_a_goal_that_holds_from_the_start_is_refused_after_few_draws(path):
+    asked = "(:goal (And (On bowl_1 table_1_left_region)))"
+    path.write_text(TEXT[: TEXT.index("(:goal")] + asked + ")")
+    message = r"two_things\.bddl:13: '\(On bowl_1 table_1_left_region\)': the goal holds in all of 100 draws"
+    with pytest.raises(RuntimeError, match=message):
+        load_task(path).init_states("train", 50)
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -69,16 +69,37 @@ def test_a_seed_gives_the_same_state_and_another_one_another():
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("(On can_1 cabinet_1_top_side)", "", "can_1 has no place"),
+        ("(On can_1 cabinet_1_top_side)", "", "<text>:8: 'can_1': it has no place in :init"),
         ("(On bowl_1 plate_1)", "(On bowl_1 plate_1) (On bowl_1 can_1)", "bowl_1 is placed twice"),
-        ("(Open cabinet_1_top_region)", "(Open plate_1)", "no such joint"),
+        ("(Open cabinet_1_top_region)", "(Open plate_1)", "plate_1 has no joint for Open"),
         (
             "(On plate_1 table_1_free_region) (On bowl_1 plate_1)",
             "(On plate_1 bowl_1) (On bowl_1 plate_1)",
             "stands on it in turn",
         ),
-        ("- wooden_cabinet", "- wooden_cabnet", "<text>: unknown category 'wooden_cabnet'"),
-        ("problem tabletop", "problem table_top", "unknown class 'table_top' in .*did you mean 'tabletop'"),
+        ("- wooden_cabinet", "- wooden_cabnet", "<text>:7: 'cabinet_1': unknown category 'wooden_cabnet'"),
+        (
+            "(On can_1 cabinet_1_top_side)",
+            "(On can_1 table_1)",
+            ":10: .*table_1 is the workspace: name one of its regions",
+        ),
+        ("(On can_1 cabinet_1_top_side)", "(On table_1 can_1)", ":10: .*table_1 is a place: only objects and fixtures"),
+        ("(:ranges ((-0.05 -0.28 -0.03 -0.26)))", "", ":9: .*has no .:ranges .* to place cabinet_1 in"),
+        (
+            "(On cabinet_1 table_1_cabinet_region)",
+            "(On cabinet_1 plate_1)",
+            "cabinet_1 is a fixture: it stands in a region of the workspace",
+        ),
+        (
+            "cabinet_1 - wooden_cabinet)",
+            "cabinet_1 - wooden_cabinet mug_1 - red_coffee_mug)",
+            "'mug_1': .* :objects, not",
+        ),
+        ("(:objects bowl_1", "(:objects oven_1 - microwave bowl_1", "'oven_1': a microwave stands .* :fixtures, not"),
+        ("bowl_1 - bowl plate_1", "bowl_1 green_bowl plate_1", ":8: 'green_bowl': a category as the name of a plate"),
+        ("(:objects bowl_1", "(:objects panda - bowl bowl_1", "'panda': .* call it panda_1"),
+        ("(:objects bowl_1", "(:objects a/b - bowl bowl_1", "'a/b': a name may not hold a slash"),
+        ("problem tabletop", "problem table_top", "<text>:2: 'table_top': unknown class .*did you mean 'tabletop'"),
     ],
 )
 def test_a_file_that_cannot_be_laid_out_is_refused(old, new, message):
@@ -90,7 +111,7 @@ def test_a_file_that_cannot_be_laid_out_is_refused(old, new, message):
 
 def test_an_infeasible_placement_ends_with_an_error_that_names_the_region():
     text = TEXT.replace("((-0.1 0.0 0.1 0.2) (-0.2 0.0 -0.15 0.2))", "((-0.04 -0.27 -0.03 -0.26))")
-    with pytest.raises(RuntimeError, match="plate_1 cannot be placed in table_1_free_region clear of the rest"):
+    with pytest.raises(RuntimeError, match="table_1_free_region': plate_1 cannot be placed in it clear of cabinet_1"):
         drawn(parse_bddl(text))
 
 

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from tensordict import NonTensorData, NonTensorStack, TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from worldenv_trl.envs.init_states import UNKNOWN_CONTEXT, InitStates
+from worldenv_trl.envs.tabletop_arguments import check_counts, check_whole
 from worldenv_trl.envs.tabletop_specs import tabletop_specs
 from worldenv_trl.keys import (
     ACTION,
@@ -54,7 +56,7 @@ class TabletopEnv(EnvBase):
     physics blows up is truncated, with a warning that says how to see it again; the others do not notice.
 
     Args:
-        task: a task, its name, or several: groups of rows are dealt to the tasks in turn (round robin).
+        task: a task, its name or file, or several: groups of rows are dealt to the tasks in turn (round robin).
         num_envs: rows.
 
     Keyword Args:
@@ -99,7 +101,7 @@ class TabletopEnv(EnvBase):
 
     def __init__(
         self,
-        task: str | Task | Sequence[str | Task],
+        task: str | Path | Task | Sequence[str | Path | Task],
         num_envs: int = 1,
         *,
         image_size: int = 64,
@@ -118,13 +120,21 @@ class TabletopEnv(EnvBase):
         seed: int | None = None,
         num_threads: int | None = None,
     ) -> None:
-        tasks = [task] if isinstance(task, str | Task) else list(task)
-        tasks = [load_task(item) if isinstance(item, str) else item for item in tasks]
-        _check_counts(tasks, num_envs, group_repeats)
+        tasks = [task] if isinstance(task, str | Path | Task) else list(task)
+        tasks = [load_task(item) if isinstance(item, str | Path) else item for item in tasks]
+        for name, value, low in (
+            ("num_envs", num_envs, 1),
+            ("group_repeats", group_repeats, 1),
+            ("init_state_id", init_state_id, 0),
+            ("init_state_count", init_state_count, 1),
+            ("max_steps", 1 if max_steps is None else max_steps, 1),
+            ("num_threads", 1 if num_threads is None else num_threads, 1),
+            ("seed", 0 if seed is None else seed, 0),
+        ):
+            check_whole(name, value, low)
+        check_counts(tasks, num_envs, group_repeats)
         if proprio not in ("commanded", "measured"):
             raise ValueError(f"proprio must be 'commanded' or 'measured', got {proprio!r}")
-        if max_steps is not None and max_steps < 1:
-            raise ValueError(f"max_steps must be at least 1, got {max_steps}")
         if init_states is not None and len(tasks) > 1:
             raise ValueError("init_states are of one task: build one env for each task")
         if isinstance(cameras, str):
@@ -199,6 +209,8 @@ class TabletopEnv(EnvBase):
         self.observation_spec, self.state_spec, self.action_spec, self.reward_spec, self.done_spec = specs
 
     def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            check_whole("seed", seed, 0)
         self._seed = int(torch.randint(2**31, ()).item()) if seed is None else int(seed)
         self._episode = np.full(self.num_envs, -1)
         for block in self._blocks:
@@ -378,14 +390,3 @@ class TabletopEnv(EnvBase):
             if self._executor is not None:
                 self._executor.shutdown()
         super().close(raise_if_closed=raise_if_closed)
-
-
-def _check_counts(tasks: list[Task], num_envs: int, group_repeats: int) -> None:
-    if not tasks:
-        raise ValueError("task is empty: name at least one, for instance 'starter/open_the_top_drawer'")
-    if len({task.name for task in tasks}) < len(tasks):
-        raise ValueError(f"a task is named twice: {', '.join(task.name for task in tasks)}")
-    if num_envs < 1 or group_repeats < 1 or num_envs % group_repeats:
-        raise ValueError(f"num_envs must be a positive multiple of group_repeats, got {num_envs} and {group_repeats}")
-    if num_envs // group_repeats < len(tasks):
-        raise ValueError(f"{len(tasks)} tasks need at least {len(tasks) * group_repeats} rows, got num_envs={num_envs}")

@@ -39,7 +39,11 @@ def load_task(name: str | Path) -> FileTask:
         return load_bddl(name)
     if name not in _known():
         close = difflib.get_close_matches(str(name), _known(), n=1, cutoff=0.3)
-        hint = f"did you mean {close[0]!r}?" if close else f"known tasks: {', '.join(_known())}"
+        hint = (
+            f"did you mean {close[0]!r}?"
+            if close
+            else f"tasks are called suite/name, suites are {', '.join(_MAX_STEPS)}"
+        )
         raise ValueError(f"unknown task {name!r}: {hint}")
     return _load(str(name))
 

@@ -23,6 +23,7 @@ __all__ = ["draw_poses", "load_poses", "save_poses", "states_from_poses"]
 
 _SETTLE_SUBSTEPS = 100
 _ATTEMPTS = 40
+_IN_VAIN = 100  # draws; when not one of so many comes to rest, no more are tried
 _MOVED, _UPRIGHT = 0.04, 0.9  # metres; cosine of the tilt: a state that settles further away is drawn again
 
 
@@ -55,8 +56,11 @@ def draw_poses(task: FileTask, split: str, start: int, count: int) -> np.ndarray
                 bind(name)[index] = value
         scene.batch.step(waiting, nstep=_SETTLE_SUBSTEPS)
         scene.batch.forward(waiting, stage=mujoco.mjtStage.mjSTAGE_POS.value)
-        moved = np.linalg.norm(scene.xpos[waiting][:, things] - drawn, axis=-1).max(-1, initial=0.0)
+        away = np.linalg.norm(scene.xpos[waiting][:, things] - drawn, axis=-1)
+        moved = away.max(-1, initial=0.0)
         upright = scene.xmat[waiting][:, things].reshape(len(waiting), len(things), 9)[..., 8]
+        if len(waiting) == count and (attempt + 1) * count >= _IN_VAIN:
+            _check_some_settle(task, away, upright, scene.success(), (attempt + 1) * count)
         fine = (moved < _MOVED) & (upright.min(-1, initial=1.0) > _UPRIGHT) & ~scene.success()[waiting]
         waiting = waiting[~fine]
         if not len(waiting):
@@ -104,6 +108,24 @@ def save_poses(task: FileTask, path: Path, count: int) -> None:
     """Draws ``count`` states of each split and writes their poses."""
     poses = {split: draw_poses(task, split, 0, count) for split in SPLITS}
     np.savez_compressed(path, digest=np.int64(task.digest), **poses)
+
+
+def _check_some_settle(task: FileTask, away: np.ndarray, upright: np.ndarray, solved: np.ndarray, draws: int) -> None:
+    """Raises ``RuntimeError`` if no row is an initial state, from how far things ``[n, things]`` strayed and lean."""
+    problem = task.problem
+    stray = (away >= _MOVED) | (upright <= _UPRIGHT)
+    if not (stray.any(-1) | solved).all():
+        return
+    if not stray.any(-1).all():
+        where = problem.where("goal", *problem.goal[0])
+        raise RuntimeError(f"{where}: the goal holds in all of {draws} draws: place things elsewhere in :init")
+    worst = int(stray.mean(0).argmax())
+    name, far = list(problem.objects)[worst], 100 * np.median(away[:, worst])
+    where = problem.where("init", *next(whole for whole in problem.init if whole[1] == name and len(whole) == 3))
+    raise RuntimeError(
+        f"{where}: {name} does not come to rest there in any of {draws} draws: it falls, tips over or is pushed "
+        f"{far:.0f} cm away: move its place, or make room"
+    )
 
 
 def _free(model: mujoco.MjModel) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -12,7 +13,7 @@ import numpy as np
 from worldenv_trl.scenes.bddl import Problem, Region
 from worldenv_trl.scenes.entities import CATEGORIES, Primitive
 from worldenv_trl.scenes.entities.registry import WORKSPACES
-from worldenv_trl.scenes.settings import part_of
+from worldenv_trl.scenes.settings import joint_of, part_of
 
 GAP = 0.002  # between footprints, m
 DROP = 0.001  # things start this much above what carries them
@@ -46,7 +47,7 @@ class Layout:
         origin: where the workspace's (0, 0) lies on our table (m).
 
     Raises:
-        ValueError: if a thing has no place, two places, or stands on something that has none.
+        BDDLError: if a thing has no place, two places, or stands on something that has none.
     """
 
     def __init__(
@@ -62,24 +63,30 @@ class Layout:
         self._on_table: list[tuple[str, Region]] = []
         self._carried: list[tuple[str, str, str]] = []  # thing, carrier, region or ""
         self._joints: list[tuple[str, str, str]] = []  # predicate, thing, region or ""
-        for predicate, first, *rest in problem.init:
-            if predicate in ("On", "In"):
-                self._place(first, rest[0])
+        for whole in problem.init:
+            if whole[0] in ("On", "In"):
+                self._place(*whole)
             else:
-                thing, part = part_of(problem, entities, first)
-                if thing not in entities or (predicate, part) not in entities[thing].states:
-                    raise ValueError(f"{problem.source}: ({predicate} {first}) in :init: it has no such joint")
-                self._joints.append((predicate, thing, part))
+                self._joints.append((whole[0], *joint_of(problem, entities, "init", whole)))
         self._order()
 
-    def _place(self, thing: str, place: str) -> None:
+    def _place(self, predicate: str, thing: str, place: str) -> None:
+        here = ("init", predicate, thing, place)
+        if thing not in self.entities:
+            raise self.problem.error(*here, message=f"{thing} is a place: only objects and fixtures can be placed")
         if thing in {name for name, _ in self._on_table} | {name for name, _, _ in self._carried}:
-            raise ValueError(f"{self.problem.source}: {thing} is placed twice in :init")
+            raise self.problem.error(*here, message=f"{thing} is placed twice in :init")
         region = self.problem.regions.get(place)
+        if region is None and place not in self.entities:
+            raise self.problem.error(*here, message=f"{place} is the workspace: name one of its regions")
         if region is not None and self._category(region.target) in WORKSPACES:
             if not region.ranges:
-                raise ValueError(f"{self.problem.source}: region {place} has no (:ranges ...) to place {thing} in")
+                message = f"region {place} has no (:ranges ...) to place {thing} in"
+                raise self.problem.error(*here, message=message)
             self._on_table.append((thing, region))
+        elif thing in self.problem.fixtures:
+            message = f"{thing} is a fixture: it stands in a region of the workspace"
+            raise self.problem.error(*here, message=message)
         else:
             self._carried.append((thing, *part_of(self.problem, self.entities, place)))
 
@@ -95,16 +102,15 @@ class Layout:
                 thing, carrier, _ = waiting[0]
                 circular = carrier in {item[0] for item in waiting}
                 lost = "stands on it in turn" if circular else "has no place in :init"
-                raise ValueError(f"{self.problem.source}: {thing} stands on {carrier}, which {lost}")
+                raise self.problem.error("thing", thing, message=f"it stands on {carrier}, which {lost}")
             ordered += ready
             placed |= {item[0] for item in ready}
             waiting = [item for item in waiting if item not in ready]
         self._carried = ordered
         lost = [name for name in self.entities if name not in placed]
         if lost:
-            raise ValueError(
-                f"{self.problem.source}: {lost[0]} has no place in :init: say where it starts, (On {lost[0]} <region>)"
-            )
+            message = f"it has no place in :init: say where it starts, (On {lost[0]} <region>)"
+            raise self.problem.error("thing", lost[0], message=message)
 
     # ------------------------------------------------------------------------------------------------- drawing
 
@@ -112,16 +118,22 @@ class Layout:
         """Writes an initial state into ``data.qpos``, ``mocap_pos`` and ``mocap_quat``.
 
         Raises:
-            RuntimeError: if things cannot be placed clear of each other, naming the last one and its region.
+            RuntimeError: if things cannot be placed clear of each other, naming the hardest to place, its region and
+                what is most often in its way.
         """
+        failures: Counter[tuple[str, str, str]] = Counter()
         for _ in range(MAX_TRIES):
             placed, failed = self._draw_table(rng)
             if failed is None:
                 break
+            failures[failed] += 1
         else:
-            thing, region = failed
-            where = f"{self.problem.source}: {thing} cannot be placed in {region.name}"
-            raise RuntimeError(f"{where} clear of the rest in {MAX_TRIES} tries: move or widen the region")
+            thing, region, other = self._hardest(failures)
+            where = self.problem.where("region", region)
+            raise RuntimeError(
+                f"{where}: {thing} cannot be placed in it clear of {other} in {MAX_TRIES} tries: move or widen the "
+                "region"
+            )
         for name, spot in placed.items():
             self._set_pose(data, name, (*spot.center, 0.0), spot.yaw)
         for predicate, thing, part in self._joints:
@@ -131,7 +143,20 @@ class Layout:
             mujoco.mj_kinematics(self.model, data)
             self._set_carried(data, thing, carrier, part, rng)
 
-    def _draw_table(self, rng: np.random.Generator) -> tuple[dict[str, _Placed], tuple[str, Region] | None]:
+    def _hardest(self, failures: Counter[tuple[str, str, str]]) -> tuple[str, str, str]:
+        """Of what failed: the thing that did so in the largest share of the tries that came as far as to it."""
+        left, worst, found = failures.total(), 0.0, None
+        for thing, _ in self._on_table:
+            mine = Counter({failed: count for failed, count in failures.items() if failed[0] == thing})
+            if mine.total() > worst * left:
+                worst, found = mine.total() / left, mine.most_common(1)[0][0]
+            left -= mine.total()
+            if not left:
+                break
+        return found
+
+    def _draw_table(self, rng: np.random.Generator) -> tuple[dict[str, _Placed], tuple[str, str, str] | None]:
+        """Footprints by name, and the thing, its region and the other thing at which it failed, if it did."""
         placed: dict[str, _Placed] = {}
         for thing, region in self._on_table:
             entity = self.entities[thing]
@@ -144,7 +169,7 @@ class Layout:
             for other, there in placed.items():
                 # Fixtures stand where the file puts them: LIBERO does not check them against each other either.
                 if not (fixed and other in self.problem.fixtures) and _overlap(spot, there):
-                    return placed, (thing, region)
+                    return placed, (thing, region.name, other)
             placed[thing] = spot
         return placed, None
 

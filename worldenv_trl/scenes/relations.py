@@ -14,7 +14,7 @@ import numpy as np
 
 from worldenv_trl.scenes.bddl import Problem
 from worldenv_trl.scenes.entities import Primitive
-from worldenv_trl.scenes.settings import part_of
+from worldenv_trl.scenes.settings import joint_of, part_of
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.simulation import SceneBatch
@@ -54,7 +54,7 @@ class Relations:
         origin: where the workspace's (0, 0) lies on our table (m).
 
     Raises:
-        ValueError: if a predicate of the goal cannot be evaluated with these things, naming the file.
+        BDDLError: if a predicate of the goal cannot be evaluated with these things, naming file and line.
     """
 
     def __init__(
@@ -67,15 +67,39 @@ class Relations:
         self.problem, self.entities, self.model = problem, entities, model
         self.origin = np.array((*origin, 0.0))
         self._data = mujoco.MjData(model)
-        for predicate, first, *rest in problem.goal:
-            if predicate in ("On", "In"):
-                self.part(rest[0])
-                if first not in entities:
-                    raise ValueError(f"{problem.source}: ({predicate} {first} ...) in :goal: not a thing")
-                continue
-            thing, part = self.part(first)
-            if thing not in entities or (predicate, part) not in entities[thing].states:
-                raise ValueError(f"{problem.source}: ({predicate} {first}) in :goal: it has no such joint")
+        for whole in problem.goal:
+            if whole[0] in ("On", "In"):
+                self._check_place(*whole)
+            else:
+                joint_of(problem, entities, "goal", whole)
+
+    def _check_place(self, predicate: str, thing: str, place: str) -> None:
+        """Raises :class:`BDDLError` for a place where nothing can ever be."""
+        here = ("goal", predicate, thing, place)
+        if thing not in self.entities:
+            raise self.problem.error(*here, message=f"{thing} is not a thing that can be put somewhere")
+        if place not in self.entities and place not in self.problem.regions:
+            raise self.problem.error(*here, message=f"{place} is the workspace: name one of its regions")
+        owner, part = self.part(place)
+        message = None
+        if owner == thing:
+            message = f"{thing} cannot be put on or into itself"
+        elif owner in self.entities:
+            regions = self.entities[owner].regions
+            if predicate == "In" and not part and "contain_region" not in regions:
+                inside = [f"{owner}_{name}" for name, region in regions.items() if not region.on_top]
+                rest = f"name one of {', '.join(inside)} (in :regions)" if inside else "did you mean On?"
+                message = f"{owner} has no contain_region: {rest}"
+        elif not self.problem.regions[place].ranges:
+            message = f"region {place} has no (:ranges ...)"
+        elif predicate == "In":
+            message = f"{place} is flat: nothing is in it, say On"
+        else:
+            x_low, y_low, x_high, y_high = self.problem.regions[place].ranges[0]
+            if x_low == x_high or y_low == y_high:
+                message = f"the first range of {place} is a line or a point: nothing can stand within it"
+        if message is not None:
+            raise self.problem.error(*here, message=message)
 
     def holds(self, scene: SceneBatch) -> np.ndarray:
         """``[n]`` bool: the whole goal holds in the current state of each row."""

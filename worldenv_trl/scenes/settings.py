@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -11,18 +11,19 @@ import mujoco
 
 from worldenv_trl.scenes import panda
 from worldenv_trl.scenes.arena import AGENTVIEW, TabletopArena
-from worldenv_trl.scenes.bddl import Problem
+from worldenv_trl.scenes.bddl import Problem, Region
 from worldenv_trl.scenes.camera import Camera, look_at
-from worldenv_trl.scenes.entities import Primitive, make_entity
+from worldenv_trl.scenes.entities import CATEGORIES, Primitive, make_entity
 from worldenv_trl.scenes.entities.base import Color
 from worldenv_trl.scenes.entities.registry import WORKSPACES
 from worldenv_trl.scenes.materials import BOARDS, GRAIN, PARQUET, PLASTER, TILES, WALL_TILES, WALLPAPER, Material
 
-__all__ = ["SETTINGS", "Setting", "compile_scene", "part_of", "setting_of"]
+__all__ = ["SETTINGS", "Setting", "compile_scene", "joint_of", "part_of", "setting_of"]
 
 # As quick as the time step allows, so that friction hardly creeps, and damped four times over critical, so that what is
 # held by two flat pads does not jitter out of them.
 CONTACT = (0.01, 4)
+_TAKEN = ("panda", "scene")
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,8 @@ def setting_of(problem: Problem) -> Setting:
     if problem.kind not in SETTINGS:
         close = difflib.get_close_matches(problem.kind, SETTINGS, n=1, cutoff=0.4)
         hint = f"did you mean {close[0]!r}?" if close else f"known ones: {', '.join(SETTINGS)}"
-        raise ValueError(
-            f"{problem.source}: unknown class {problem.kind!r} in (problem ...), where the task plays: {hint}"
+        raise problem.error(
+            "problem", problem.kind, message=f"unknown class in (problem ...), which says where the task plays: {hint}"
         )
     return SETTINGS[problem.kind]
 
@@ -86,7 +87,8 @@ def compile_scene(problem: Problem) -> tuple[dict[str, Primitive], mujoco.MjMode
     """The things of a task file by name, and the scene they make up.
 
     Raises:
-        ValueError: for an unknown problem class or category, naming the file.
+        BDDLError: for an unknown problem class or category, a fixture among the objects or an object among the
+            fixtures, or a region off the table, naming file and line.
     """
     setting = setting_of(problem)
     arena = TabletopArena(
@@ -99,32 +101,82 @@ def compile_scene(problem: Problem) -> tuple[dict[str, Primitive], mujoco.MjMode
     entities: dict[str, Primitive] = {}
     for named, add in ((problem.fixtures, arena.add_fixture), (problem.objects, arena.add_object)):
         for name, category in named.items():
+            _check_instance(problem, name, category, fixture=named is problem.fixtures)
             if category in WORKSPACES:
                 continue
             try:
                 entities[name] = make_entity(category, name)
             except ValueError as error:
-                raise ValueError(f"{problem.source}: {error}") from None
+                raise problem.error("thing", name, message=str(error)) from None
             entities[name].mjcf_model.default.geom.solref = CONTACT
             add(entities[name])
     for side in ("left", "right"):
         arena.root.find("geom", f"panda/{side}_pad").solref = CONTACT
-    return entities, mujoco.MjModel.from_xml_string(arena.root.to_xml_string(), arena.root.get_assets())
+    model = mujoco.MjModel.from_xml_string(arena.root.to_xml_string(), arena.root.get_assets())
+    for region in problem.regions.values():
+        if region.target not in entities:
+            _check_region(problem, region, setting.origin, model.geom("table").size)
+    return entities, model
+
+
+def _check_instance(problem: Problem, name: str, category: str, *, fixture: bool) -> None:
+    if name in CATEGORIES and name != category:
+        message = f"a category as the name of a {category}: write a dash before it, 'name - {name}'"
+        raise problem.error("thing", name, message=message)
+    if name in _TAKEN:
+        raise problem.error("thing", name, message=f"the scene has a part of this name already: call it {name}_1")
+    if "/" in name:
+        raise problem.error("thing", name, message="a name may not hold a slash")
+    stands = category in WORKSPACES or (category in CATEGORIES and CATEGORIES[category].stands)
+    if (category in WORKSPACES or category in CATEGORIES) and stands != fixture:
+        here, there = (":fixtures", ":objects") if fixture else (":objects", ":fixtures")
+        why = "stands still" if stands else "can be moved"
+        raise problem.error("thing", name, message=f"a {category} {why}: declare it under {there}, not {here}")
+
+
+def _check_region(problem: Problem, region: Region, origin: tuple[float, float], half_size: Sequence[float]) -> None:
+    bounds = [(-half_size[axis] - origin[axis], half_size[axis] - origin[axis]) for axis in range(2)]
+    for row in region.ranges:
+        for axis, (low, high) in enumerate(bounds):
+            for value in row[axis::2]:
+                if not low <= value <= high:
+                    message = (
+                        f"range ({' '.join(f'{number:g}' for number in row)}) lies off the table: {'xy'[axis]} = "
+                        f"{value:g} is not in [{low:.2f}, {high:.2f}] m"
+                    )
+                    raise problem.error("region", region.name, message=message)
 
 
 def part_of(problem: Problem, entities: Mapping[str, Primitive], name: str) -> tuple[str, str]:
     """The entity, or workspace, and its region (or "") that ``name`` means.
 
     Raises:
-        ValueError: if the entity has no such region, naming the file and the regions it has.
+        BDDLError: if the entity has no such region, naming the file and the regions it has.
     """
     if name in entities:
         return name, ""
     if name not in problem.regions:
-        raise ValueError(f"{problem.source}: {name!r} is neither a thing nor a region here")
+        raise problem.error("thing", name, message="this is neither an entity nor a region")
     target = problem.regions[name].target
     part = name.removeprefix(f"{target}_")
     if target in entities and part not in entities[target].regions:
         known = ", ".join(entities[target].regions) or "none"
-        raise ValueError(f"{problem.source}: {target} has no region {part!r}; it has {known}")
+        raise problem.error("region", name, message=f"{target} has no region {part!r}; it has {known}")
     return target, part
+
+
+def joint_of(problem: Problem, entities: Mapping[str, Primitive], block: str, predicate: tuple[str, ...]) -> tuple:
+    """The entity and its part whose joint ``Open``, ``Close``, ``TurnOn`` or ``TurnOff`` is about.
+
+    Raises:
+        BDDLError: if it has no such joint, naming the file, the line in ``block`` and the parts that have one.
+    """
+    verb, name = predicate
+    workspace = name not in entities and name not in problem.regions
+    thing, part = (name, "") if workspace else part_of(problem, entities, name)
+    if workspace or thing not in entities or (verb, part) not in entities[thing].states:
+        states = entities[thing].states if thing in entities else {}
+        names = [f"{thing}_{own}" if own else thing for known, own in states if known == verb]
+        rest = f": of {thing} they are {', '.join(names)}" if names else ""
+        raise problem.error(block, *predicate, message=f"{name} has no joint for {verb}{rest}")
+    return thing, part

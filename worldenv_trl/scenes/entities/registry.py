@@ -29,6 +29,11 @@ class Category:
     options: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     yaw: float = 0.0
 
+    @property
+    def stands(self) -> bool:
+        """Whether it is a fixture, which never moves, and no object."""
+        return issubclass(self.entity, (Cabinet, Caddy, Microwave, Rack, Shelf, Stove))
+
 
 def _as(entity: type[Primitive], *, yaw: float = 0.0, **options: object) -> Category:
     return Category(entity, MappingProxyType(options), yaw)

@@ -9,7 +9,7 @@ import numpy as np
 
 from worldenv_trl.scenes.files import FileTask
 from worldenv_trl.scenes.skills.clearance import travel
-from worldenv_trl.scenes.skills.phase import FINGER_HALF, OPEN, Phase, body, half_turn, upwards
+from worldenv_trl.scenes.skills.phase import FINGER_HALF, OPEN, Phase, body, half_turn, tcp, upwards
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.simulation import SceneBatch
@@ -53,10 +53,6 @@ def push_to(task: FileTask, thing: str, place: str, again: int) -> list[Phase]:
         Phase(lambda s, m: travel(s, task, start(s, 0.10)), OPEN, tolerance=0.02, limit=40, yaw=yaw),
         Phase(lambda s, m: start(s, _LOW), OPEN, tolerance=0.008, yaw=yaw),
         Phase(push, OPEN, tolerance=0.010, speed=0.3, limit=60),
-        Phase(lambda s, m: m + upwards(0.08), OPEN, tolerance=0.02, remember=_hand, still=there),
+        Phase(lambda s, m: m + upwards(0.08), OPEN, tolerance=0.02, remember=tcp, still=there),
     ]
     return [replace(phase, again=again) for phase in phases]
-
-
-def _hand(scene: SceneBatch) -> np.ndarray:
-    return scene.site_xpos[:, scene.model.site("panda/tcp").id].copy()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -43,19 +44,8 @@ def pull_open(task: FileTask, thing: str, part: str, again: int) -> list[Phase]:
     def opened(scene: SceneBatch) -> np.ndarray:
         return joint(scene, f"{thing}/{drawer}") < cabinet.OPEN_BELOW
 
-    phases = [
-        Phase(
-            lambda s, m: travel(s, task, hook(s, _OVER)),
-            CLOSE,
-            tolerance=0.012,
-            limit=40,
-            yaw=lambda s: _across(s, thing),
-        ),
-        Phase(lambda s, m: hook(s), CLOSE, tolerance=0.006, limit=20),
-        Phase(pulled, CLOSE, tolerance=0.006, limit=60, still=hooked),
-        Phase(lambda s, m: m + upwards(0.10), CLOSE, tolerance=0.02, remember=tcp, still=opened),
-    ]
-    return [replace(phase, again=again) for phase in phases]
+    work = Phase(pulled, CLOSE, tolerance=0.006, limit=60, still=hooked)
+    return _stroke(task, again, hook, (0.012, 0.006), lambda s: _across(s, thing), work, done=opened)
 
 
 def push_closed(task: FileTask, thing: str, part: str, again: int) -> list[Phase]:
@@ -72,19 +62,8 @@ def push_closed(task: FileTask, thing: str, part: str, again: int) -> list[Phase
     def pushed(scene: SceneBatch, memory: np.ndarray) -> np.ndarray:
         return before(scene, gap=0.0) - _STOP * _outwards(scene, thing)
 
-    phases = [
-        Phase(
-            lambda s, m: travel(s, task, before(s, _OVER)),
-            CLOSE,
-            tolerance=0.015,
-            limit=40,
-            yaw=lambda s: _across(s, thing),
-        ),
-        Phase(lambda s, m: before(s), CLOSE, tolerance=0.010, limit=20),
-        Phase(pushed, CLOSE, tolerance=0.004, limit=40),
-        Phase(lambda s, m: m + upwards(0.10), CLOSE, tolerance=0.02, remember=tcp),
-    ]
-    return [replace(phase, again=again) for phase in phases]
+    work = Phase(pushed, CLOSE, tolerance=0.004, limit=40)
+    return _stroke(task, again, before, (0.015, 0.010), lambda s: _across(s, thing), work)
 
 
 def _close_door(task: FileTask, thing: str, again: int) -> list[Phase]:
@@ -101,19 +80,11 @@ def _close_door(task: FileTask, thing: str, again: int) -> list[Phase]:
         local = hinge + radius * along + (0.006 + FINGER_HALF + gap) * outside
         return body(scene, thing) + np.einsum("nij,nj->ni", axes(scene, thing), local) + upwards(height)
 
-    phases = [
-        Phase(
-            lambda s, m: travel(s, task, beside(s, -0.25, high + _OVER, 0.03)),
-            CLOSE,
-            tolerance=0.02,
-            limit=40,
-            yaw=_straight,
-        ),
-        Phase(lambda s, m: beside(s, -0.25, high, 0.03), CLOSE, tolerance=0.012, limit=20),
-        Phase(lambda s, m: beside(s, 0.30, high, 0.0), CLOSE, tolerance=0.004, limit=70),
-        Phase(lambda s, m: m + upwards(0.10), CLOSE, tolerance=0.02, remember=tcp),
-    ]
-    return [replace(phase, again=again) for phase in phases]
+    def before(scene: SceneBatch, height: float = 0.0) -> np.ndarray:
+        return beside(scene, -0.25, high + height, 0.03)
+
+    work = Phase(lambda s, m: beside(s, 0.30, high, 0.0), CLOSE, tolerance=0.004, limit=70)
+    return _stroke(task, again, before, (0.02, 0.012), _straight, work)
 
 
 def turn(task: FileTask, thing: str, again: int, on: bool = True) -> list[Phase]:
@@ -131,11 +102,34 @@ def turn(task: FileTask, thing: str, again: int, on: bool = True) -> list[Phase]
         return body(scene, thing) + np.einsum("nij,nj->ni", axes(scene, thing), local) + upwards(height)
 
     behind = -0.055 / stove.PEG_RADIUS
+
+    def before(scene: SceneBatch, height: float = 0.0) -> np.ndarray:
+        return along(scene, behind, 0.03 + height)
+
+    work = Phase(lambda s, m: along(s, 0.35, 0.03), CLOSE, tolerance=0.012, limit=40)
+    return _stroke(task, again, before, (0.02, 0.008), _straight, work, over=0.08)
+
+
+def _stroke(
+    task: FileTask,
+    again: int,
+    start: Callable[..., np.ndarray],
+    tolerances: tuple[float, float],
+    yaw: Callable[[SceneBatch], np.ndarray],
+    work: Phase,
+    *,
+    over: float = _OVER,
+    done: Callable[[SceneBatch], np.ndarray] | None = None,
+) -> list[Phase]:
+    """Closed fingers travel to ``over`` the ``start(scene, height)``, go down, do the ``work`` and leave upwards.
+
+    ``tolerances`` are those of the travel and of the way down; ``done`` is what must still hold on the way up.
+    """
     phases = [
-        Phase(lambda s, m: travel(s, task, along(s, behind, 0.11)), CLOSE, tolerance=0.02, limit=40, yaw=_straight),
-        Phase(lambda s, m: along(s, behind, 0.03), CLOSE, tolerance=0.008, limit=20),
-        Phase(lambda s, m: along(s, 0.35, 0.03), CLOSE, tolerance=0.012, limit=40),
-        Phase(lambda s, m: m + upwards(0.10), CLOSE, tolerance=0.02, remember=tcp),
+        Phase(lambda s, m: travel(s, task, start(s, over)), CLOSE, tolerance=tolerances[0], limit=40, yaw=yaw),
+        Phase(lambda s, m: start(s), CLOSE, tolerance=tolerances[1], limit=20),
+        work,
+        Phase(lambda s, m: m + upwards(0.10), CLOSE, tolerance=0.02, remember=tcp, still=done),
     ]
     return [replace(phase, again=again) for phase in phases]
 

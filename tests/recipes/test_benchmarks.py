@@ -1,0 +1,56 @@
+"""Benchmarks refuse what cannot be measured in one line, before anything is measured."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+import show_scenes
+
+FOLDER = Path(show_scenes.__file__).parent / "benchmarks"
+
+
+def benchmark(name: str):
+    """A benchmark as a module; its name may be that of a recipe."""
+    spec = importlib.util.spec_from_file_location(f"benchmark_of_{name}", FOLDER / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("scenes", {"tasks": ("gaol",)}, "'gaol' is no suite"),
+        ("scenes", {"tasks": ("goal/open_the_top_drawr",)}, "did you mean 'goal/open_the_top_drawer'"),
+        ("scenes", {"tasks": ("nowhere.bddl",)}, "there is no task file nowhere.bddl"),
+        ("scenes", {"tasks": ()}, "--tasks is empty"),
+        ("scenes", {"rows": (0, 16)}, "--rows must be at least 1, got 0"),
+        ("scenes", {"rows": ()}, "--rows is empty"),
+        ("scenes", {"threads": (0,)}, "--threads must be at least 1, got 0"),
+        ("scenes", {"image_sizes": (8,)}, "--image-sizes must be at least 16, got 8"),
+        ("scenes", {"repeats": 0}, "--repeats must be at least 1, got 0"),
+        ("scenes", {"seconds": 0.0}, "--seconds must be positive, got 0.0"),
+        ("expert", {"tasks": ("gaol",)}, "'gaol' is no suite"),
+        ("expert", {"tasks": ("goal/open_the_top_drawr",)}, "did you mean 'goal/open_the_top_drawer'"),
+        ("expert", {"tasks": ("nowhere.bddl",)}, "there is no task file nowhere.bddl"),
+        ("expert", {"count": 0}, "--count must be at least 1, got 0"),
+        ("expert", {"processes": 0}, "--processes must be at least 1, got 0"),
+        ("sft", {"suite": "gaol"}, "unknown suite 'gaol'"),
+        ("sft", {"episodes_per_task": 0}, "--episodes-per-task must be at least 1, got 0"),
+        ("sft", {"num_threads": 0}, "num_threads must be at least 1, got 0"),
+        ("sft", {"seed": -1}, "seed must be a whole number of at least 0, got -1"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(name, settings, message, tmp_path):
+    module = benchmark(name)
+    if name == "sft":
+        settings = {"run_dir": tmp_path / "run"} | settings
+    kind = module.Benchmark if name == "scenes" else module.Settings
+    with pytest.raises(SystemExit, match=f"^error: .*{message}"):
+        module.main(kind(**settings))
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,43 @@
+"""Suites, tasks and files on a command line, and numbers that cannot be."""
+
+from __future__ import annotations
+
+import pytest
+
+from refusal import at_least, one_line_errors
+from task_names import named_tasks
+from worldenv_trl.scenes import list_tasks
+
+
+def test_suites_tasks_and_files_are_taken_once_and_in_order():
+    words = ["goal/turn_on_the_stove", "starter", "mine.bddl", "starter/open_the_top_drawer"]
+    assert named_tasks(words) == ["goal/turn_on_the_stove", *list_tasks("starter"), "mine.bddl"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["gaol"], "'gaol' is no suite, and tasks are written suite/name: did you mean 'goal'"),
+        (["open_the_middle_drawer"], "did you mean 'goal/open_the_middle_drawer'"),
+        (["zzz"], "suites are spatial, object, goal, long, starter"),
+        ([], "--tasks is empty"),
+    ],
+)
+def test_a_word_that_is_none_of_them_is_answered_with_what_is_close(words, message):
+    with pytest.raises(ValueError, match=message):
+        named_tasks(words)
+
+
+def test_numbers_that_are_too_small_are_named_like_their_options():
+    at_least(1, rows=(1, 2), repeats=1)
+    with pytest.raises(ValueError, match="--image-sizes must be at least 16, got 8"):
+        at_least(16, image_sizes=(64, 8))
+    with pytest.raises(ValueError, match="--rows is empty"):
+        at_least(1, rows=())
+
+
+def test_other_errors_keep_their_traceback():
+    with pytest.raises(SystemExit, match="error: no such file"), one_line_errors():
+        raise FileNotFoundError("no such file")
+    with pytest.raises(KeyError), one_line_errors():
+        raise KeyError("a mistake of ours")
