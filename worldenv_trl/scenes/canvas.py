@@ -8,19 +8,31 @@ behind what moves pixel by pixel, by the rule of GL's own depth test. And the de
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from PIL import Image
-
-Paint = Callable[[mujoco.MjModel, np.ndarray], None]
 
 # Twice the pixels each way and a mean: in software GL cheaper than MuJoCo's four samples a pixel, and unlike those not
 # done under a lock that all contexts share, so that two threads draw nearly twice as fast as one.
 SUPERSAMPLING = 2
 _HIDDEN = 5  # a geom group that MuJoCo does not draw
 _SLACK = 1e-3  # metres that a geom may be outside the field of view and still be drawn
+
+
+class Glow(NamedTuple):
+    """Geom ``geom`` has the colour ``on`` (RGBA in [0, 1]) where ``qpos[address] >= threshold``, else ``off``."""
+
+    geom: int
+    address: int
+    threshold: float
+    on: tuple[float, float, float, float]
+    off: tuple[float, float, float, float]
+
+    def apply(self, model: mujoco.MjModel, qpos: np.ndarray) -> None:
+        model.geom_rgba[self.geom] = self.on if qpos[self.address] >= self.threshold else self.off
 
 
 class Canvas:
@@ -30,16 +42,16 @@ class Canvas:
         model: the compiled model; a copy of it is drawn.
         cameras: names of the cameras.
         image_size: height and width (px).
-        paint: called with the copy and a state's ``qpos`` before it is drawn, to set colours that depend on the state
-            (a burner that glows). It may not recolour what never moves, nor make anything transparent.
+        glows: colours that depend on the state (a burner). What never moves in front of a camera that does not either
+            may not glow, and nothing may be transparent.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, cameras: Sequence[str], image_size: int, paint: Paint | None = None
+        self, model: mujoco.MjModel, cameras: Sequence[str], image_size: int, glows: Sequence[Glow] = ()
     ) -> None:
         from OpenGL import GL  # only now: MuJoCo has chosen the platform, and without images there need be none
 
-        self._gl, self._paint, size = GL, paint, SUPERSAMPLING * image_size
+        self._gl, self._glows, size = GL, tuple(glows), SUPERSAMPLING * image_size
         self._model = model = copy.copy(model)
         model.vis.quality.offsamples = 0
         model.vis.global_.offwidth = model.vis.global_.offheight = size
@@ -73,8 +85,8 @@ class Canvas:
         data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = qpos, mocap_pos, mocap_quat
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
-        if self._paint is not None:
-            self._paint(model, qpos)
+        for glow in self._glows:
+            glow.apply(model, qpos)
         for view, image in zip(self._views, images, strict=True):
             seen = view.distances(data, self._geoms) > self._reach
             model.geom_group[:] = np.where(seen.all(1), view.groups, _HIDDEN)

@@ -14,6 +14,7 @@ from mujoco.batch import Batch
 
 from worldenv_trl.scenes import panda, predicates
 from worldenv_trl.scenes.arena import TabletopArena
+from worldenv_trl.scenes.canvas import Glow
 from worldenv_trl.scenes.entities.cookware import Stove
 from worldenv_trl.scenes.entities.storage import Cabinet
 from worldenv_trl.scenes.entities.tableware import Bowl, Plate
@@ -58,10 +59,8 @@ class StarterTask(Task):
             holds &= predicates.PREDICATES[predicate](scene, *arguments)
         return holds
 
-    def paint(self, model: mujoco.MjModel, qpos: np.ndarray) -> None:
-        for placement in self.placements:
-            if placement.entity is Stove:
-                Stove.paint(model, placement.name, qpos)
+    def glows(self, model: mujoco.MjModel) -> list[Glow]:
+        return [Stove.glow(model, placement.name) for placement in self.placements if placement.entity is Stove]
 
     def init_states(self, split: str, count: int = 50) -> np.ndarray:
         self._check_split(split, count)
