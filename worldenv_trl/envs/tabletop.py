@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from tensordict import NonTensorData, NonTensorStack, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from worldenv_trl.envs.init_states import UNKNOWN_CONTEXT, InitStates
+from worldenv_trl.envs.row_texts import row_texts
 from worldenv_trl.envs.tabletop_specs import tabletop_specs
 from worldenv_trl.keys import (
     ACTION,
@@ -188,9 +189,7 @@ class TabletopEnv(EnvBase):
             self._limit[block.rows] = task.max_steps if max_steps is None else max_steps
             for row in block.rows:
                 words[row] = task.language
-        # One text for all rows costs nothing; a stack is copied row by row at every step.
-        stack = NonTensorStack(*(NonTensorData(text) for text in words))
-        self._text = NonTensorData(words[0], batch_size=[n]) if len(set(words)) == 1 else stack
+        self._text = row_texts(words, self.device)
 
     def _make_specs(self) -> None:
         images = {_IMAGE_NAMES[name]: image.shape[1:] for name, image in self._images.items()}

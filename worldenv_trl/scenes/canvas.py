@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from PIL import Image
 
 # Twice the pixels each way and a mean: in software GL cheaper than MuJoCo's four samples a pixel, and unlike those not
 # done under a lock that all contexts share, so that two threads draw nearly twice as fast as one.
 SUPERSAMPLING = 2
 _HIDDEN = 5  # a geom group that MuJoCo does not draw
+_HALVES, _QUARTER = np.uint64(0x0002_0002_0002_0002), np.uint64(2)  # of a sum of four, for each of four channels
 _SLACK = 1e-3  # metres that a geom may be outside the field of view and still be drawn
 
 
@@ -66,7 +66,10 @@ class Canvas:
         self._buffer = self._replace_depth_buffer(size)
         self._pixels, self._depth = np.zeros((size, 4 * size), np.uint8), np.zeros((size, size), np.float32)
         self._colors = self._pixels.view(np.uint32)  # one number a pixel
-        self._fine = Image.frombuffer("RGBX", (size, size), self._pixels, "raw", "RGBX", 0, 1)  # looks at the pixels
+        # Room to calculate in: memory that is new for every image costs as much again as the calculation.
+        self._nearer = np.empty((size, size), bool)
+        self._sums = np.empty((image_size, 4 * size), np.uint16)
+        self._means = np.empty((image_size, image_size), np.uint64)
         radius = np.where(model.geom_rbound > 0, model.geom_rbound, np.inf)  # a plane is everywhere
         self._reach = -(radius + _SLACK)[:, None]
         self._views = [_View(model, name) for name in cameras]
@@ -95,7 +98,7 @@ class Canvas:
             if view.background is not None:
                 colors, depth, farther = view.background
                 gl.glReadPixels(0, 0, *self._depth.shape, gl.GL_DEPTH_COMPONENT, gl.GL_FLOAT, self._depth)
-                np.copyto(self._colors, colors, where=farther(self._depth, depth))
+                np.copyto(self._colors, colors, where=farther(self._depth, depth, out=self._nearer))
             self._shrink_into(image)
 
     def close(self) -> None:
@@ -110,10 +113,14 @@ class Canvas:
         mujoco.mjr_render(self._rect, self._scene, self._context)
 
     def _shrink_into(self, image: np.ndarray) -> None:
-        """Means of the ``SUPERSAMPLING x SUPERSAMPLING`` blocks of the pixels, rounded; GL's rows go bottom up."""
-        size = image.shape[-1]
-        small = np.frombuffer(self._fine.reduce(SUPERSAMPLING).tobytes(), np.uint8).reshape(size, size, 4)
-        image[:] = small[::-1, :, :3].transpose(2, 0, 1)
+        """Means of the 2 x 2 blocks of the pixels, rounded; GL's rows go bottom up."""
+        size, sums, means = image.shape[-1], self._sums, self._means
+        np.add(self._pixels[::2], self._pixels[1::2], out=sums, dtype=np.uint16)
+        pairs = sums.view(np.uint64).reshape(size, size, 2)  # one number a pixel again: its four channels of 16 bits
+        np.add(pairs[..., 0], pairs[..., 1], out=means)
+        np.add(means, _HALVES, out=means)
+        np.right_shift(means, _QUARTER, out=means)
+        image[:] = means.view(np.uint8).reshape(size, size, 8)[::-1, :, :6:2].transpose(2, 0, 1)
 
     def _replace_depth_buffer(self, size: int) -> int | None:
         """MuJoCo's holds 64 bits a pixel, half of them for a stencil that only reflections need."""

@@ -52,7 +52,7 @@ class RendererPool:
     """Draws rows of every model that was added: on a thread of its own, helped by ``num_threads - 1`` processes.
 
     Two threads of one process hardly draw faster than one. Helpers are started in the background once the pool has
-    drawn for half a second, and join in when they are ready, so that a pool that draws little never pays for them. Painters
+    drawn for half a second, and join in when they are ready: a pool that draws little never pays for them. Painters
     take the next row as they get there, and a row's image is the same bit for bit whoever draws it. If a helper fails,
     what it was drawing is drawn again here and the pool goes on without, with a warning.
 
