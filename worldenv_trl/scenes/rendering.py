@@ -12,7 +12,7 @@ import tempfile
 import time
 import warnings
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +40,7 @@ from worldenv_trl.scenes.canvas import Canvas, Glow  # noqa: E402 - imports MuJo
 from worldenv_trl.scenes.painters import Helper, Painter, Row  # noqa: E402
 from worldenv_trl.scenes.shared_rows import RECORD, Layout, SharedRows  # noqa: E402
 
-__all__ = ["Drawing", "RendererPool", "Row"]
+__all__ = ["Drawing", "Frames", "RendererPool", "Row"]
 
 PAYS_AFTER = 0.5  # seconds of drawing, about what it costs to start a helper: at worst that is paid twice
 _SHARED_ROWS = 4  # of a drawing; with fewer, it is left to one painter
@@ -70,7 +70,7 @@ class RendererPool:
         self._close.atexit = False
         self._check(self._painter.wait())
         atexit.register(self._close)
-        self._running: _Round | None = None
+        self._frames: Frames | None = None
         self._seconds = 0.0
 
     def add(
@@ -96,19 +96,20 @@ class RendererPool:
 
     def render(self, drawings: Sequence[Drawing], rows: Sequence[Sequence[Row]]) -> list[dict[str, np.ndarray]]:
         """Draws several models at once: for each, and each camera, ``[len(rows), 3, H, W]`` uint8, upright."""
-        return self.start(drawings, rows)()
+        frames = self.begin()
+        images = [frames.add(drawing, poses) for drawing, poses in zip(drawings, rows, strict=True)]
+        frames.finish()
+        return images
 
-    def start(
-        self, drawings: Sequence[Drawing], rows: Sequence[Sequence[Row]]
-    ) -> Callable[[], list[dict[str, np.ndarray]]]:
-        """Begins to ``render``; what it returns must be called, waits for the end and gives the images."""
-        if self._running is not None:
+    def begin(self) -> Frames:
+        """Rows to draw are added to what this returns; one that was not finished is waited for first."""
+        if self._frames is not None:
             with contextlib.suppress(Exception):
-                self._running.finish()  # its caller was interrupted
+                self._frames.finish()  # its caller was interrupted
         if self._seconds > PAYS_AFTER:
             self._crew.hire(self._drawings)
-        self._running = _Round(self, drawings, rows)
-        return self._running.finish
+        self._frames = Frames(self)
+        return self._frames
 
     @property
     def helpers(self) -> list[int]:
@@ -201,7 +202,7 @@ class _Crew:
             self.dismiss(str(error))
         return [] if any(helper.due for helper in self._helpers) else self._helpers
 
-    def issue(self, tickets: Sequence[bytes]) -> None:
+    def issue(self, tickets: Iterable[bytes]) -> None:
         """Offers rows to every painter, this process's included."""
         os.write(self._write_end, b"".join(tickets))
 
@@ -240,70 +241,84 @@ class _Crew:
             )
 
 
-class _Round:
-    """The drawing of some rows; those that helpers may draw are ``open`` until they are drawn."""
+class Frames:
+    """Images that are being drawn; rows that helpers may draw are ``open`` until they are drawn."""
 
-    def __init__(self, pool: RendererPool, drawings: Sequence[Drawing], rows: Sequence[Sequence[Row]]) -> None:
+    def __init__(self, pool: RendererPool) -> None:
         self._pool, self._crew, self._painter = pool, pool._crew, pool._painter
-        self.images, self._own, self._open, self._busy = [], [], {}, False
-        helpers = self._crew.ready()
-        if len(set(drawings)) < len(drawings) or any(
-            len(poses) > drawing.num_rows for drawing, poses in zip(drawings, rows, strict=True)
-        ):
-            helpers = []  # there is room for each row once
-        shared, private = [], {helper: [] for helper in helpers}
-        for drawing, poses in zip(drawings, rows, strict=True):
-            shape = (len(poses), 3, drawing.image_size, drawing.image_size)
-            self.images.append({name: np.empty(shape, np.uint8) for name in drawing.cameras})
-            views = zip(*self.images[-1].values(), strict=True)
-            jobs = [(drawing.number, pose, images) for pose, images in zip(poses, views, strict=True)]
-            if not helpers or drawing.home == 0:
-                self._own += jobs
-                continue
-            parts = max(1, -(-len(poses) // (_MOST_TICKETS // len(drawings))))
-            tickets = []
-            for first in range(0, len(poses), parts):
-                tickets.append(RECORD.pack(drawing.number, first, len(poses[first : first + parts])))
-                self._open[tickets[-1]] = jobs[first : first + parts]
-            for row, pose in enumerate(poses):
-                for there, here in zip(self._crew.shared[drawing.number].pose(row), pose, strict=True):
-                    there[:] = here
-            if drawing.home is None:
-                shared += tickets
-            else:
-                private[helpers[drawing.home - 1]] += tickets
-        if not helpers:
-            self._begin()
-            return
-        try:
-            self._crew.issue(shared)
-            for helper, tickets in private.items():
-                if tickets:
-                    helper.draw(tickets)
-        except OSError as error:
-            self._give_up(error)
+        self._helpers = list(self._crew.ready())
+        self._own: list[tuple] = []
+        self._open: dict[bytes, list[tuple]] = {}
+        self._room = {drawing.number: drawing.num_rows for drawing in pool._drawings} if self._helpers else {}
+        self._busy = 0  # jobs that the painter has
 
-    def finish(self) -> list[dict[str, np.ndarray]]:
-        if not self._busy:  # beside a helper that draws already, this thread's Python would only be held up
+    @property
+    def helped(self) -> bool:
+        """Whether rows are drawn from when they are added, on other cores."""
+        return bool(self._helpers)
+
+    def add(self, drawing: Drawing, rows: Sequence[Row]) -> dict[str, np.ndarray]:
+        """Begins to draw: for each camera ``[len(rows), 3, H, W]`` uint8, which ``finish`` completes."""
+        shape = (len(rows), 3, drawing.image_size, drawing.image_size)
+        images = {name: np.empty(shape, np.uint8) for name in drawing.cameras}
+        views = zip(*images.values(), strict=True)
+        jobs = [(drawing.number, pose, places) for pose, places in zip(rows, views, strict=True)]
+        if not self._helpers:
+            self._own += jobs
             self._begin()
-        error = self._painter.wait()
-        self._busy = False
+        elif drawing.home == 0 or len(rows) > self._room[drawing.number]:
+            self._own += jobs
+        else:
+            self._offer(drawing, jobs)
+        return images
+
+    def finish(self) -> None:
+        """Waits until everything that was added is drawn. Raises the first error."""
+        if self._helpers:  # not before: beside the caller's Python, this process would hardly draw
+            self._begin()
+        error = self._wait()
         try:
             while self._open:
                 for ticket in self._crew.reports():
                     self._collect(ticket)
         except OSError as failure:
             self._give_up(failure)
-            self._begin()
-            error = self._painter.wait() or error
-        self._pool._running = None
+            error = self._wait() or error
+        self._pool._frames = None
         if error is not None:
             raise error
-        return self.images
+
+    def _offer(self, drawing: Drawing, jobs: list[tuple]) -> None:
+        shared = self._crew.shared[drawing.number]
+        start = drawing.num_rows - self._room[drawing.number]
+        for row, (_, pose, _) in enumerate(jobs, start):
+            for there, here in zip(shared.pose(row), pose, strict=True):
+                there[:] = here
+        self._room[drawing.number] -= len(jobs)
+        size = max(1, -(-drawing.num_rows * len(self._room) // _MOST_TICKETS))
+        tickets = {}
+        for first in range(0, len(jobs), size):
+            part = jobs[first : first + size]
+            tickets[RECORD.pack(drawing.number, start + first, len(part))] = part
+        self._open |= tickets
+        try:
+            if drawing.home is None:
+                self._crew.issue(tickets)
+            else:
+                self._helpers[drawing.home - 1].draw(tickets)
+        except OSError as error:
+            self._give_up(error)
 
     def _begin(self) -> None:
-        self._busy = True
+        self._busy += 1
         self._painter.call(self._paint)
+
+    def _wait(self) -> Exception | None:
+        errors = []
+        while self._busy:
+            errors.append(self._painter.wait())
+            self._busy -= 1
+        return next((error for error in errors if error is not None), None)
 
     def _paint(self, painter: Painter) -> None:
         started = time.perf_counter()
@@ -328,8 +343,10 @@ class _Round:
     def _give_up(self, error: OSError) -> None:
         """What the helpers have not drawn is left to this process."""
         self._crew.dismiss(str(error))
+        self._helpers.clear()
         self._own += [job for jobs in self._open.values() for job in jobs]
         self._open.clear()
+        self._begin()
 
 
 def _cores() -> int:
