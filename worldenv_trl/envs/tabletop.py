@@ -47,23 +47,6 @@ class _Block:
     num_groups: int
 
 
-class _Drawn:
-    """The images of one step, which are drawn from when a row is shown."""
-
-    def __init__(self, pool: RendererPool) -> None:
-        self._frames = pool.begin()
-        self.helped, self.parts = self._frames.helped, []
-
-    def show(self, block: _Block, local: np.ndarray) -> None:
-        self.parts.append((block.rows[local], self._frames.add(block.scene.drawing, block.scene.poses(local))))
-
-    def collect(self, buffers: dict[str, np.ndarray]) -> None:
-        self._frames.finish()
-        for rows, images in self.parts:
-            for buffer, image in zip(buffers.values(), images.values(), strict=True):
-                buffer[rows] = image
-
-
 class TabletopEnv(EnvBase):
     """``num_envs`` copies of one or several tasks, stepped and rendered together. Batch-locked; honours ``_step``.
 
@@ -92,7 +75,8 @@ class TabletopEnv(EnvBase):
         proprio: ``measured`` writes the hand's pose and opening as they are, ``commanded`` the controller's targets.
         with_sim_state: write MuJoCo's integration state, padded with zeros to the longest of the tasks.
         seed: of the order of initial states; drawn from torch's generator when None.
-        num_threads: of physics and rendering; two at most by default.
+        num_threads: of physics, and processes that draw (this one, and helpers that start once they pay); two at most
+            by default.
 
     Keys written: the images, ``("observation", "state")``, ``kinematic_state``, ``language_instruction``, ``task_id``,
     ``context_id`` (:func:`~worldenv_trl.envs.init_states.context_id`), ``num_steps``, ``success``, optionally
@@ -300,11 +284,7 @@ class TabletopEnv(EnvBase):
         broken = np.zeros((self.num_envs, 1), bool)
         shares = [action[block.rows] for block in self._blocks]
         masks = [active[block.rows] for block in self._blocks]
-        frames = _Drawn(self._pool) if self._pool is not None else None
-        moved = None
-        if frames is not None and frames.helped:
-            moved = lambda index, local: frames.show(self._blocks[index], local)  # noqa: E731
-        failures = step_together([block.scene for block in self._blocks], shares, masks, self._executor, moved)
+        failures = step_together([block.scene for block in self._blocks], shares, masks, self._executor)
         for block, local in zip(self._blocks, failures, strict=True):
             broken[block.rows[local]] = True
             for row in block.rows[local]:
@@ -315,7 +295,7 @@ class TabletopEnv(EnvBase):
                     stacklevel=2,
                 )
         self._steps[active] += 1
-        self._read(active, frames)
+        self._read(active)
         self._reward[active] = self._success[active]
         out = self._observe()
         terminated = self._success & self.terminate_on_success
@@ -338,20 +318,24 @@ class TabletopEnv(EnvBase):
             raise ValueError(f"{ACTION!r} holds NaN or infinity in rows {np.flatnonzero(broken).tolist()}")
         return action
 
-    def _read(self, active: np.ndarray, frames: _Drawn | None = None) -> None:
-        """Brings what ``active`` rows show up to date; some may be shown in ``frames`` already."""
+    def _read(self, active: np.ndarray) -> None:
+        """Brings what ``active`` rows show up to date."""
         parts = [(block, np.flatnonzero(active[block.rows])) for block in self._blocks]
         parts = [(block, local) for block, local in parts if len(local)]
+        scenes = [block.scene for block, _ in parts]
         if not parts:
             return
+        finish = None
         if self._pool is not None:
-            frames = frames or _Drawn(self._pool)
-            if not frames.parts:
-                for block, local in parts:
-                    frames.show(block, local)
-        self._read_state(parts)  # while the images are drawn
-        if self._pool is not None:
-            frames.collect(self._images)
+            poses = [block.scene.poses(local) for block, local in parts]
+            finish = self._pool.start([scene.drawing for scene in scenes], poses)
+        try:
+            self._read_state(parts)  # while the images are drawn
+        finally:
+            drawn = [] if finish is None else finish()
+        for (block, local), images in zip(parts, drawn, strict=finish is not None):
+            for buffer, image in zip(self._images.values(), images.values(), strict=True):
+                buffer[block.rows[local]] = image
 
     def _read_state(self, parts: list[tuple[_Block, np.ndarray]]) -> None:
         scenes = [block.scene for block, _ in parts]

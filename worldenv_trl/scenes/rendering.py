@@ -12,7 +12,7 @@ import tempfile
 import time
 import warnings
 import weakref
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +40,7 @@ from worldenv_trl.scenes.canvas import Canvas, Glow  # noqa: E402 - imports MuJo
 from worldenv_trl.scenes.painters import Helper, Painter, Row  # noqa: E402
 from worldenv_trl.scenes.shared_rows import RECORD, Layout, SharedRows  # noqa: E402
 
-__all__ = ["Drawing", "Frames", "RendererPool", "Row"]
+__all__ = ["Drawing", "RendererPool", "Row"]
 
 PAYS_AFTER = 0.5  # seconds of drawing, about what it costs to start a helper: at worst that is paid twice
 _SHARED_ROWS = 4  # of a drawing; with fewer, it is left to one painter
@@ -70,7 +70,7 @@ class RendererPool:
         self._close.atexit = False
         self._check(self._painter.wait())
         atexit.register(self._close)
-        self._frames: Frames | None = None
+        self._frames: _Frames | None = None
         self._seconds = 0.0
 
     def add(
@@ -96,20 +96,19 @@ class RendererPool:
 
     def render(self, drawings: Sequence[Drawing], rows: Sequence[Sequence[Row]]) -> list[dict[str, np.ndarray]]:
         """Draws several models at once: for each, and each camera, ``[len(rows), 3, H, W]`` uint8, upright."""
-        frames = self.begin()
-        images = [frames.add(drawing, poses) for drawing, poses in zip(drawings, rows, strict=True)]
-        frames.finish()
-        return images
+        return self.start(drawings, rows)()
 
-    def begin(self) -> Frames:
-        """Rows to draw are added to what this returns; one that was not finished is waited for first."""
+    def start(
+        self, drawings: Sequence[Drawing], rows: Sequence[Sequence[Row]]
+    ) -> Callable[[], list[dict[str, np.ndarray]]]:
+        """Begins to ``render``; what it returns must be called, waits for the end and gives the images."""
         if self._frames is not None:
             with contextlib.suppress(Exception):
                 self._frames.finish()  # its caller was interrupted
         if self._seconds > PAYS_AFTER:
             self._crew.hire(self._drawings)
-        self._frames = Frames(self)
-        return self._frames
+        self._frames = _Frames(self, drawings, rows)
+        return self._frames.finish
 
     @property
     def helpers(self) -> list[int]:
@@ -241,39 +240,41 @@ class _Crew:
             )
 
 
-class Frames:
+class _Frames:
     """Images that are being drawn; rows that helpers may draw are ``open`` until they are drawn."""
 
-    def __init__(self, pool: RendererPool) -> None:
+    def __init__(self, pool: RendererPool, drawings: Sequence[Drawing], rows: Sequence[Sequence[Row]]) -> None:
         self._pool, self._crew, self._painter = pool, pool._crew, pool._painter
         self._helpers = list(self._crew.ready())
+        self._room = {drawing.number: drawing.num_rows for drawing in drawings}
         self._own: list[tuple] = []
         self._open: dict[bytes, list[tuple]] = {}
-        self._room = {drawing.number: drawing.num_rows for drawing in pool._drawings} if self._helpers else {}
         self._busy = 0  # jobs that the painter has
-
-    @property
-    def helped(self) -> bool:
-        """Whether rows are drawn from when they are added, on other cores."""
-        return bool(self._helpers)
-
-    def add(self, drawing: Drawing, rows: Sequence[Row]) -> dict[str, np.ndarray]:
-        """Begins to draw: for each camera ``[len(rows), 3, H, W]`` uint8, which ``finish`` completes."""
-        shape = (len(rows), 3, drawing.image_size, drawing.image_size)
-        images = {name: np.empty(shape, np.uint8) for name in drawing.cameras}
-        views = zip(*images.values(), strict=True)
-        jobs = [(drawing.number, pose, places) for pose, places in zip(rows, views, strict=True)]
-        if not self._helpers:
-            self._own += jobs
+        self.images = []
+        offers = []
+        for drawing, poses in zip(drawings, rows, strict=True):
+            shape = (len(poses), 3, drawing.image_size, drawing.image_size)
+            self.images.append({name: np.empty(shape, np.uint8) for name in drawing.cameras})
+            views = zip(*self.images[-1].values(), strict=True)
+            jobs = [(drawing.number, pose, places) for pose, places in zip(poses, views, strict=True)]
+            if self._helpers and drawing.home != 0 and len(poses) <= self._room[drawing.number]:
+                offers.append((drawing, self._share(drawing, jobs)))
+            else:
+                self._own += jobs
+        try:
+            for drawing, tickets in offers:
+                self._open |= tickets
+                if drawing.home is None:
+                    self._crew.issue(tickets)
+                else:
+                    self._helpers[drawing.home - 1].draw(tickets)
+        except OSError as error:
+            self._give_up(error)
+        if not self._helpers and not self._busy:
             self._begin()
-        elif drawing.home == 0 or len(rows) > self._room[drawing.number]:
-            self._own += jobs
-        else:
-            self._offer(drawing, jobs)
-        return images
 
-    def finish(self) -> None:
-        """Waits until everything that was added is drawn. Raises the first error."""
+    def finish(self) -> list[dict[str, np.ndarray]]:
+        """Waits until everything is drawn. Raises the first error."""
         if self._helpers:  # not before: beside the caller's Python, this process would hardly draw
             self._begin()
         error = self._wait()
@@ -287,27 +288,19 @@ class Frames:
         self._pool._frames = None
         if error is not None:
             raise error
+        return self.images
 
-    def _offer(self, drawing: Drawing, jobs: list[tuple]) -> None:
-        shared = self._crew.shared[drawing.number]
-        start = drawing.num_rows - self._room[drawing.number]
+    def _share(self, drawing: Drawing, jobs: list[tuple]) -> dict[bytes, list[tuple]]:
+        """Puts the poses where helpers see them; the tickets for these rows."""
+        shared, room = self._crew.shared[drawing.number], self._room[drawing.number]
+        start = drawing.num_rows - room
+        self._room[drawing.number] = room - len(jobs)
         for row, (_, pose, _) in enumerate(jobs, start):
             for there, here in zip(shared.pose(row), pose, strict=True):
                 there[:] = here
-        self._room[drawing.number] -= len(jobs)
-        size = max(1, -(-drawing.num_rows * len(self._room) // _MOST_TICKETS))
-        tickets = {}
-        for first in range(0, len(jobs), size):
-            part = jobs[first : first + size]
-            tickets[RECORD.pack(drawing.number, start + first, len(part))] = part
-        self._open |= tickets
-        try:
-            if drawing.home is None:
-                self._crew.issue(tickets)
-            else:
-                self._helpers[drawing.home - 1].draw(tickets)
-        except OSError as error:
-            self._give_up(error)
+        size = -(-drawing.num_rows * len(self._room) // _MOST_TICKETS)
+        parts = {first: jobs[first : first + size] for first in range(0, len(jobs), size)}
+        return {RECORD.pack(drawing.number, start + first, len(part)): part for first, part in parts.items()}
 
     def _begin(self) -> None:
         self._busy += 1

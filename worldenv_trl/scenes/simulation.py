@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from typing import TYPE_CHECKING
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from worldenv_trl.scenes.tasks import Task
 
 _POSITIONS = mujoco.mjtStage.mjSTAGE_POS.value
-_WORTH_HALVING = 8  # rows
 _MAX_SPEED = 1e4  # m/s or rad/s; a simulation that is faster has blown up
 
 
@@ -33,7 +32,7 @@ class SceneBatch:
         num_envs: number of rows ``n``.
         image_size: height and width (px), at least 16.
         cameras: cameras to render (``agentview``, ``wrist``), or none.
-        num_threads: threads for physics and rendering; default: one per core, two at most.
+        num_threads: of physics, and processes that draw (see :class:`RendererPool`); two by default.
         pool: draws the images, instead of threads of the batch's own; the batch does not close it.
 
     Raises:
@@ -182,23 +181,18 @@ def step_together(
     actions: Sequence[np.ndarray],
     active: Sequence[np.ndarray | None],
     executor: Executor | None = None,
-    moved: Callable[[int, np.ndarray], None] | None = None,
 ) -> list[np.ndarray]:
-    """``SceneBatch.step`` for several batches; those with one thread step side by side on ``executor``.
-
-    ``moved``, if given, is called with the index of a batch and some of its rows as soon as those are in their new
-    state, while others have yet to move.
-    """
+    """``SceneBatch.step`` for several batches; those with one thread step side by side on ``executor``."""
     every = [
         np.arange(scene.num_envs, dtype=np.int32) if mask is None else np.flatnonzero(mask).astype(np.int32)
         for scene, mask in zip(scenes, active, strict=True)
     ]
-    asked = np.concatenate([action[rows] for action, rows in zip(actions, every, strict=True)])
-    if not len(asked):
+    moved = np.concatenate([action[rows] for action, rows in zip(actions, every, strict=True)])
+    if not len(moved):
         return every
     targets = np.concatenate([scene._targets[rows] for scene, rows in zip(scenes, every, strict=True)])
     angles = np.concatenate([scene.qpos[rows[:, None], scene._arm] for scene, rows in zip(scenes, every, strict=True)])
-    targets = controller.advance_targets(targets, asked)
+    targets = controller.advance_targets(targets, moved)
     joints = controller.joint_targets(angles, targets)
     broken, waiting, start = list(every), [], 0
     for index, (scene, rows) in enumerate(zip(scenes, every, strict=True)):
@@ -208,19 +202,10 @@ def step_together(
         before = scene._aim(rows, targets[share], joints[share])
         if executor is not None and scene.batch.nthread == 1:
             waiting.append((index, executor.submit(scene._advance, rows, before)))
-            continue
-        # What is to be drawn can be drawn while the other half moves.
-        parts = 2 if moved is not None and len(scenes) == 1 and len(rows) >= _WORTH_HALVING else 1
-        failed = []
-        for half, state in zip(np.array_split(rows, parts), np.array_split(before, parts), strict=True):
-            failed.append(scene._advance(half, state))
-            if moved is not None:
-                moved(index, half)
-        broken[index] = np.concatenate(failed)
+        else:
+            broken[index] = scene._advance(rows, before)
     for index, result in waiting:
         broken[index] = result.result()
-        if moved is not None:
-            moved(index, every[index])
     return broken
 
 
