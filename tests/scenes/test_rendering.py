@@ -60,7 +60,7 @@ def test_a_pool_draws_several_models_of_any_number_of_rows_as_each_alone():
         scene = SceneBatch(task, count, image_size=32, num_threads=1)
         scene.reset(np.arange(count), task.init_states("test", count))
         alone.append(scene.render()["agentview"]), poses.append(scene.poses())
-        drawings.append(pool.add(scene.model, ["agentview"], 32, count, task.paint))
+        drawings.append(pool.add(scene.model, ["agentview"], 32, count, task.glows(scene.model)))
         scene.close()
     for _ in range(3):
         for images, expected in zip(pool.render(drawings, poses), alone, strict=True):

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tensordict import NonTensorData, NonTensorStack, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from worldenv_trl.envs.init_states import UNKNOWN_CONTEXT, InitStates
+from worldenv_trl.envs.row_texts import row_texts
 from worldenv_trl.envs.tabletop_arguments import check_counts, check_whole
 from worldenv_trl.envs.tabletop_specs import tabletop_specs
 from worldenv_trl.keys import (
@@ -76,7 +77,8 @@ class TabletopEnv(EnvBase):
         proprio: ``measured`` writes the hand's pose and opening as they are, ``commanded`` the controller's targets.
         with_sim_state: write MuJoCo's integration state, padded with zeros to the longest of the tasks.
         seed: of the order of initial states; drawn from torch's generator when None.
-        num_threads: of physics and rendering; two at most by default.
+        num_threads: of physics, and processes that draw (this one, and helpers that start once they pay); two at most
+            by default.
 
     Keys written: the images, ``("observation", "state")``, ``kinematic_state``, ``language_instruction``, ``task_id``,
     ``context_id`` (:func:`~worldenv_trl.envs.init_states.context_id`), ``num_steps``, ``success``, optionally
@@ -198,9 +200,7 @@ class TabletopEnv(EnvBase):
             self._limit[block.rows] = task.max_steps if max_steps is None else max_steps
             for row in block.rows:
                 words[row] = task.language
-        # One text for all rows costs nothing; a stack is copied row by row at every step.
-        stack = NonTensorStack(*(NonTensorData(text) for text in words))
-        self._text = NonTensorData(words[0], batch_size=[n]) if len(set(words)) == 1 else stack
+        self._text = row_texts(words, self.device)
 
     def _make_specs(self) -> None:
         images = {_IMAGE_NAMES[name]: image.shape[1:] for name, image in self._images.items()}

@@ -8,19 +8,31 @@ behind what moves pixel by pixel, by the rule of GL's own depth test. And the de
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from PIL import Image
-
-Paint = Callable[[mujoco.MjModel, np.ndarray], None]
 
 # Twice the pixels each way and a mean: in software GL cheaper than MuJoCo's four samples a pixel, and unlike those not
 # done under a lock that all contexts share, so that two threads draw nearly twice as fast as one.
 SUPERSAMPLING = 2
 _HIDDEN = 5  # a geom group that MuJoCo does not draw
+_HALVES, _QUARTER = np.uint64(0x0002_0002_0002_0002), np.uint64(2)  # of a sum of four, for each of four channels
 _SLACK = 1e-3  # metres that a geom may be outside the field of view and still be drawn
+
+
+class Glow(NamedTuple):
+    """Geom ``geom`` has the colour ``on`` (RGBA in [0, 1]) where ``qpos[address] >= threshold``, else ``off``."""
+
+    geom: int
+    address: int
+    threshold: float
+    on: tuple[float, float, float, float]
+    off: tuple[float, float, float, float]
+
+    def apply(self, model: mujoco.MjModel, qpos: np.ndarray) -> None:
+        model.geom_rgba[self.geom] = self.on if qpos[self.address] >= self.threshold else self.off
 
 
 class Canvas:
@@ -30,16 +42,16 @@ class Canvas:
         model: the compiled model; a copy of it is drawn.
         cameras: names of the cameras.
         image_size: height and width (px).
-        paint: called with the copy and a state's ``qpos`` before it is drawn, to set colours that depend on the state
-            (a burner that glows). It may not recolour what never moves, nor make anything transparent.
+        glows: colours that depend on the state (a burner). What never moves in front of a camera that does not either
+            may not glow, and nothing may be transparent.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, cameras: Sequence[str], image_size: int, paint: Paint | None = None
+        self, model: mujoco.MjModel, cameras: Sequence[str], image_size: int, glows: Sequence[Glow] = ()
     ) -> None:
         from OpenGL import GL  # only now: MuJoCo has chosen the platform, and without images there need be none
 
-        self._gl, self._paint, size = GL, paint, SUPERSAMPLING * image_size
+        self._gl, self._glows, size = GL, tuple(glows), SUPERSAMPLING * image_size
         self._model = model = copy.copy(model)
         model.vis.quality.offsamples = 0
         model.vis.global_.offwidth = model.vis.global_.offheight = size
@@ -54,7 +66,10 @@ class Canvas:
         self._buffer = self._replace_depth_buffer(size)
         self._pixels, self._depth = np.zeros((size, 4 * size), np.uint8), np.zeros((size, size), np.float32)
         self._colors = self._pixels.view(np.uint32)  # one number a pixel
-        self._fine = Image.frombuffer("RGBX", (size, size), self._pixels, "raw", "RGBX", 0, 1)  # looks at the pixels
+        # Room to calculate in: memory that is new for every image costs as much again as the calculation.
+        self._nearer = np.empty((size, size), bool)
+        self._sums = np.empty((image_size, 4 * size), np.uint16)
+        self._means = np.empty((image_size, image_size), np.uint64)
         radius = np.where(model.geom_rbound > 0, model.geom_rbound, np.inf)  # a plane is everywhere
         self._reach = -(radius + _SLACK)[:, None]
         self._views = [_View(model, name) for name in cameras]
@@ -73,8 +88,8 @@ class Canvas:
         data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = qpos, mocap_pos, mocap_quat
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
-        if self._paint is not None:
-            self._paint(model, qpos)
+        for glow in self._glows:
+            glow.apply(model, qpos)
         for view, image in zip(self._views, images, strict=True):
             seen = view.distances(data, self._geoms) > self._reach
             model.geom_group[:] = np.where(seen.all(1), view.groups, _HIDDEN)
@@ -83,7 +98,7 @@ class Canvas:
             if view.background is not None:
                 colors, depth, farther = view.background
                 gl.glReadPixels(0, 0, *self._depth.shape, gl.GL_DEPTH_COMPONENT, gl.GL_FLOAT, self._depth)
-                np.copyto(self._colors, colors, where=farther(self._depth, depth))
+                np.copyto(self._colors, colors, where=farther(self._depth, depth, out=self._nearer))
             self._shrink_into(image)
 
     def close(self) -> None:
@@ -98,10 +113,14 @@ class Canvas:
         mujoco.mjr_render(self._rect, self._scene, self._context)
 
     def _shrink_into(self, image: np.ndarray) -> None:
-        """Means of the ``SUPERSAMPLING x SUPERSAMPLING`` blocks of the pixels, rounded; GL's rows go bottom up."""
-        size = image.shape[-1]
-        small = np.frombuffer(self._fine.reduce(SUPERSAMPLING).tobytes(), np.uint8).reshape(size, size, 4)
-        image[:] = small[::-1, :, :3].transpose(2, 0, 1)
+        """Means of the 2 x 2 blocks of the pixels, rounded; GL's rows go bottom up."""
+        size, sums, means = image.shape[-1], self._sums, self._means
+        np.add(self._pixels[::2], self._pixels[1::2], out=sums, dtype=np.uint16)
+        pairs = sums.view(np.uint64).reshape(size, size, 2)  # one number a pixel again: its four channels of 16 bits
+        np.add(pairs[..., 0], pairs[..., 1], out=means)
+        np.add(means, _HALVES, out=means)
+        np.right_shift(means, _QUARTER, out=means)
+        image[:] = means.view(np.uint8).reshape(size, size, 8)[::-1, :, :6:2].transpose(2, 0, 1)
 
     def _replace_depth_buffer(self, size: int) -> int | None:
         """MuJoCo's holds 64 bits a pixel, half of them for a stencil that only reflections need."""

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from worldenv_trl.scenes.bddl import Problem, read_bddl
+from worldenv_trl.scenes.canvas import Glow
 from worldenv_trl.scenes.entities import Primitive
 from worldenv_trl.scenes.entities.cookware import Stove
 from worldenv_trl.scenes.initial import draw_poses, load_poses, states_from_poses
@@ -59,10 +60,8 @@ class FileTask(Task):
     def evaluate(self, scene: SceneBatch) -> np.ndarray:
         return self.relations.holds(scene)
 
-    def paint(self, model: mujoco.MjModel, qpos: np.ndarray) -> None:
-        for name, entity in self.entities.items():
-            if isinstance(entity, Stove):
-                entity.paint(model, name, qpos)
+    def glows(self, model: mujoco.MjModel) -> list[Glow]:
+        return [entity.glow(model, name) for name, entity in self.entities.items() if isinstance(entity, Stove)]
 
     def init_states(self, split: str, count: int = 50) -> np.ndarray:
         self._check_split(split, count)

@@ -32,7 +32,7 @@ class SceneBatch:
         num_envs: number of rows ``n``.
         image_size: height and width (px), at least 16.
         cameras: cameras to render (``agentview``, ``wrist``), or none.
-        num_threads: threads for physics and rendering; default: one per core, two at most.
+        num_threads: of physics, and processes that draw (see :class:`RendererPool`); two by default.
         pool: draws the images, instead of threads of the batch's own; the batch does not close it.
 
     Raises:
@@ -77,7 +77,7 @@ class SceneBatch:
         if cameras:
             self._own_pool = RendererPool(min(threads, num_envs)) if pool is None else None
             names = [known[name] for name in cameras]
-            self.drawing = (pool or self._own_pool).add(self.model, names, image_size, num_envs, task.paint)
+            self.drawing = (pool or self._own_pool).add(self.model, names, image_size, num_envs, task.glows(self.model))
 
     def reset(self, rows: np.ndarray, sim_state: np.ndarray) -> None:
         """Puts ``rows [k]`` into integration states ``sim_state [k, S]``, exactly.
@@ -136,9 +136,10 @@ class SceneBatch:
         return dict(zip(self.cameras, self.drawing.render(self.poses(rows)).values(), strict=True))
 
     def poses(self, rows: np.ndarray | None = None) -> list[Row]:
-        """Where everything is in ``rows``, for a renderer."""
-        rows = range(self.num_envs) if rows is None else rows
-        return [(self.qpos[row], self._mocap_pos[row], self._mocap_quat[row]) for row in rows]
+        """Where everything is in ``rows`` (copies), for a renderer."""
+        rows = slice(None) if rows is None else rows
+        copies = (np.array(field[rows]) for field in (self.qpos, self._mocap_pos, self._mocap_quat))
+        return list(zip(*copies, strict=True))
 
     def measured_state(self) -> np.ndarray:
         """Hand position (m), axis-angle (rad) and gripper opening as they are, ``[n, 7]`` float32."""

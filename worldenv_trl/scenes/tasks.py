@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from worldenv_trl.scenes.arena import AGENTVIEW
 from worldenv_trl.scenes.camera import Camera
+from worldenv_trl.scenes.canvas import Glow
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.simulation import SceneBatch
@@ -44,8 +46,13 @@ class Task(abc.ABC):
         """``[n]`` bool: every predicate of the goal holds in the current state."""
 
     @abc.abstractmethod
-    def paint(self, model: mujoco.MjModel, qpos: np.ndarray) -> None:
+    def glows(self, model: mujoco.MjModel) -> Sequence[Glow]:
         """Colours that show the state: a burner glows while its stove is on."""
+
+    def paint(self, model: mujoco.MjModel, qpos: np.ndarray) -> None:
+        """Gives ``model`` the colours that show the state ``qpos``."""
+        for glow in self.glows(model):
+            glow.apply(model, qpos)
 
     @abc.abstractmethod
     def init_states(self, split: str, count: int = 50) -> np.ndarray:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import mujoco
-import numpy as np
 from dm_control import mjcf
 
+from worldenv_trl.scenes.canvas import Glow
 from worldenv_trl.scenes.entities.base import GHOST, Grasp, JointState, Primitive
 from worldenv_trl.scenes.materials import WORN
 
@@ -87,10 +87,11 @@ class Stove(Primitive):
         self.states["TurnOff", ""] = JointState("lever", -math.inf, 0.2, (0.0, 0.0))
 
     @classmethod
-    def paint(cls, model: mujoco.MjModel, name: str, qpos: np.ndarray) -> None:
+    def glow(cls, model: mujoco.MjModel, name: str) -> Glow:
         """The burner of stove ``name`` glows while it is on."""
-        lit = qpos[model.joint(f"{name}/lever").qposadr[0]] >= cls.ON_ABOVE
-        model.geom(f"{name}/burner").rgba = (1.0, 0.12, 0.05, 1) if lit else (0.18, 0.18, 0.2, 1)
+        address = int(model.joint(f"{name}/lever").qposadr[0])
+        burner = model.geom(f"{name}/burner").id
+        return Glow(burner, address, cls.ON_ABOVE, (1.0, 0.12, 0.05, 1), (0.18, 0.18, 0.2, 1))
 
 
 class WideStove(Stove):
