@@ -11,7 +11,7 @@ from worldenv_trl.scenes.entities import Primitive
 from worldenv_trl.scenes.entities.cookware import Stove
 from worldenv_trl.scenes.entities.storage import Cabinet, Microwave
 from worldenv_trl.scenes.skills.clearance import travel
-from worldenv_trl.scenes.skills.phase import CLOSE, FINGER_HALF, Phase, axes, body, half_turn, joint, tcp, upwards
+from worldenv_trl.scenes.skills.phase import CLOSE, FINGER_HALF, OPEN, Phase, axes, body, half_turn, joint, tcp, upwards
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.files import FileTask
@@ -59,7 +59,10 @@ def pull_open(task: FileTask, thing: str, part: str, again: int) -> list[Phase]:
 
 
 def push_closed(task: FileTask, thing: str, part: str, again: int) -> list[Phase]:
-    """Phases that push a drawer or a microwave's door closed with closed fingers."""
+    """Phases that push a drawer or a microwave's door closed with closed fingers.
+
+    They close on the way down: a closed hand high above looks, to a policy without memory, like one that still carries.
+    """
     if isinstance(task.entities[thing], Microwave):
         return _close_door(task, thing, again)
     cabinet = _fixture(task, thing, Cabinet, "pushed closed")
@@ -75,7 +78,7 @@ def push_closed(task: FileTask, thing: str, part: str, again: int) -> list[Phase
     phases = [
         Phase(
             lambda s, m: travel(s, task, before(s, _OVER)),
-            CLOSE,
+            OPEN,
             tolerance=0.015,
             limit=40,
             yaw=lambda s: _across(s, thing),
@@ -104,7 +107,7 @@ def _close_door(task: FileTask, thing: str, again: int) -> list[Phase]:
     phases = [
         Phase(
             lambda s, m: travel(s, task, beside(s, -0.25, high + _OVER, 0.03)),
-            CLOSE,
+            OPEN,
             tolerance=0.02,
             limit=40,
             yaw=_straight,
