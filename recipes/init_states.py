@@ -1,15 +1,21 @@
 """Draws the standard initial states of the suites' tasks and stores them beside their files, over those that are there.
 
-``python recipes/init_states.py``, after a task file has changed; 50 of each split, fixed by the file's text.
+``python recipes/init_states.py``, after a task file has changed; 50 of each split, fixed by the file's text. Every
+state is tried: one that the scripted expert does not solve is drawn again.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 from dataclasses import dataclass
+from functools import partial
 
+import numpy as np
 import tyro
 
-from worldenv_trl.scenes import list_suites, list_tasks, load_task
+from refusal import at_least, one_line_errors
+from task_names import SUITES, named_tasks
+from worldenv_trl.scenes import SceneBatch, ScriptedExpert, Task, load_task
 from worldenv_trl.scenes.initial import save_poses
 
 
@@ -17,20 +23,49 @@ from worldenv_trl.scenes.initial import save_poses
 class Settings:
     """What is drawn."""
 
-    suites: tuple[str, ...] = tuple(list_suites())
+    tasks: tuple[str, ...] = SUITES
+    """Suites, and tasks of them."""
     count: int = 50
     """States of each split."""
+    processes: int = 2
 
 
 def main(settings: Settings) -> None:
-    unknown = set(settings.suites) - set(list_suites())
-    if unknown:
-        raise SystemExit(f"unknown suite {unknown.pop()!r}: it must be one of {', '.join(list_suites())}")
-    for suite in settings.suites:
-        for name in list_tasks(suite):
-            task = load_task(name)
-            save_poses(task, task.states, settings.count)
-            print(f"{name}: {settings.count} + {settings.count} states, {task.states.stat().st_size / 1024:.0f} kB")
+    with one_line_errors():
+        at_least(1, count=settings.count, processes=settings.processes)
+        names = named_tasks(settings.tasks)
+        foreign = [name for name in names if load_task(name).states is None]
+        if foreign:
+            raise ValueError(f"{foreign[0]} is no task of the suites: states of other files are drawn when asked for")
+        with multiprocessing.get_context("spawn").Pool(settings.processes) as pool:
+            for lines in pool.imap(partial(store, count=settings.count), names):
+                print("\n".join(lines), flush=True)
+
+
+def store(name: str, count: int) -> list[str]:
+    """Draws and stores the states of a task; what there is to say about it."""
+    task = load_task(name)
+    redrawn = save_poses(task, task.states, count, partial(solved_by_expert, task))
+    lines = [f"{name}: {count} + {count} states, {task.states.stat().st_size / 1024:.0f} kB"]
+    for split, times in redrawn.items():
+        for index in np.flatnonzero(times):
+            lines.append(
+                f"  {split} {index}: drawn {times[index] + 1} times, the expert did not solve what came before"
+            )
+    return lines
+
+
+def solved_by_expert(task: Task, states: np.ndarray) -> np.ndarray:
+    """``[n]`` bool: the scripted expert reaches the goal from ``states [n, S]`` within the task's steps."""
+    scene, expert = SceneBatch(task, len(states), cameras=(), num_threads=1), ScriptedExpert(task)
+    scene.reset(np.arange(len(states)), states)
+    solved = scene.success()
+    for _ in range(task.max_steps):
+        scene.step(expert(scene), active=~solved)
+        solved |= scene.success()
+        if solved.all():
+            break
+    return solved
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import pytest
 
 from worldenv_trl.policies import OFTConfig
 from worldenv_trl.scenes import SceneBatch, ScriptedExpert, list_suites, list_tasks, load_task
-from worldenv_trl.scenes.initial import draw_poses, load_poses, states_from_poses
+from worldenv_trl.scenes.initial import draw_poses, load_poses, save_poses, states_from_poses
 
 NAMES = [name for suite in list_suites() for name in list_tasks(suite)]
 
@@ -72,6 +72,23 @@ def test_stored_states_are_what_the_seed_draws_and_more_extend_them(name):
     more = task.init_states("train", 52)
     assert np.array_equal(more[:50], task.init_states("train"))
     assert np.array_equal(more[50:], states_from_poses(task, draw_poses(task, "train", 50, 2)))
+
+
+def test_a_state_that_the_check_refuses_is_drawn_again_and_no_other(tmp_path):
+    task, path = load_task(NAMES[0]), tmp_path / "states.npz"
+    assert not any(refusals.any() for refusals in save_poses(task, path, 4).values())
+    before, bytes_before = load_poses(task, path), path.read_bytes()
+    unwanted = states_from_poses(task, before["train"][2:3])
+    redrawn = save_poses(task, path, 4, lambda states: (states != unwanted).any(-1))
+    assert redrawn["train"].tolist() == [0, 0, 1, 0] and not redrawn["test"].any()
+    after = load_poses(task, path)
+    assert np.array_equal(after["test"], before["test"])
+    assert (after["train"] != before["train"]).any(-1).tolist() == [False, False, True, False]
+    save_poses(task, path, 4, lambda states: np.ones(len(states), bool))
+    assert path.read_bytes() == bytes_before
+    with pytest.raises(RuntimeError, match=rf"{task.name}: train initial state 2 is not solved in any of 10 draws"):
+        save_poses(task, path, 4, lambda states: np.arange(len(states)) != (2 if len(states) == 4 else 0))
+    assert path.read_bytes() == bytes_before
 
 
 def test_states_of_another_version_of_a_file_are_refused():

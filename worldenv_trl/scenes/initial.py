@@ -6,6 +6,7 @@ read from a file are the same, bit for bit.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,10 +20,13 @@ from worldenv_trl.scenes.tasks import SPLITS
 if TYPE_CHECKING:
     from worldenv_trl.scenes.files import FileTask
 
-__all__ = ["draw_poses", "load_poses", "save_poses", "states_from_poses"]
+__all__ = ["Check", "draw_poses", "load_poses", "save_poses", "states_from_poses"]
+
+Check = Callable[[np.ndarray], np.ndarray]
+"""Which of the integration states ``[n, S]`` may be kept, ``[n]`` bool: those that an expert solves, say."""
 
 _SETTLE_SUBSTEPS = 100
-_ATTEMPTS = 40
+_ATTEMPTS, _REFUSALS = 40, 10
 _IN_VAIN = 100  # draws; when not one of so many comes to rest, no more are tried
 _MOVED, _UPRIGHT = 0.04, 0.9  # metres; cosine of the tilt: a state that settles further away is drawn again
 
@@ -30,16 +34,23 @@ _MOVED, _UPRIGHT = 0.04, 0.9  # metres; cosine of the tilt: a state that settles
 def draw_poses(task: FileTask, split: str, start: int, count: int) -> np.ndarray:
     """Poses ``[count, P]`` float32 of states from number ``start`` on: at rest, the goal not yet fulfilled.
 
+    Nobody has tried whether the goal can be reached from them: :func:`save_poses` does.
+
     Raises:
         RuntimeError: if things cannot be placed clear of each other, or do not come to rest where they were placed.
     """
+    return _draw(task, split, start, count, None)[0]
+
+
+def _draw(task: FileTask, split: str, start: int, count: int, check: Check | None) -> tuple[np.ndarray, np.ndarray]:
+    """The poses ``[count, P]``, and how often ``check`` has refused each state ``[count]``."""
     model = task.build()
     things = np.array([model.body(f"{name}/").id for name in task.problem.objects], int)
     scene = SceneBatch(task, count, cameras=())
     data = mujoco.MjData(model)
     qpos, ctrl, targets = home_state(model, panda.HOME_Q)
     bind = scene.batch.bind
-    waiting = np.arange(count, dtype=np.int32)
+    waiting, refusals = np.arange(count, dtype=np.int32), np.zeros(count, int)
     for attempt in range(_ATTEMPTS):
         drawn = np.zeros((len(waiting), len(things), 3))
         for row, index in enumerate(waiting):
@@ -62,12 +73,22 @@ def draw_poses(task: FileTask, split: str, start: int, count: int) -> np.ndarray
         if len(waiting) == count and (attempt + 1) * count >= _IN_VAIN:
             _check_some_settle(task, away, upright, scene.success(), (attempt + 1) * count)
         fine = (moved < _MOVED) & (upright.min(-1, initial=1.0) > _UPRIGHT) & ~scene.success()[waiting]
+        if check is not None and fine.any():
+            rows = waiting[fine]
+            refused = ~check(states_from_poses(task, _poses(scene)[rows]))
+            refusals[rows[refused]] += 1
+            fine[fine] = ~refused
+            if refusals.max() == _REFUSALS:
+                raise RuntimeError(
+                    f"{task.name}: {split} initial state {start + int(refusals.argmax())} is not solved in any of "
+                    f"{_REFUSALS} draws: narrow the regions in the file, or mend the expert"
+                )
         waiting = waiting[~fine]
         if not len(waiting):
-            return np.concatenate([part.reshape(count, -1) for part in _parts(scene)], -1).astype(np.float32)
+            return _poses(scene), refusals
     raise RuntimeError(
-        f"{task.name}: initial state {start + int(waiting[0])} does not come to rest in {_ATTEMPTS} tries: something "
-        "falls, is pushed away from its region in :init, or fulfils the goal at once"
+        f"{task.name}: {split} initial state {start + int(waiting[0])} does not come to rest in {_ATTEMPTS} tries: "
+        "something falls, is pushed away from its region in :init, or fulfils the goal at once"
     )
 
 
@@ -104,10 +125,21 @@ def load_poses(task: FileTask, path: Path) -> dict[str, np.ndarray]:
     return poses
 
 
-def save_poses(task: FileTask, path: Path, count: int) -> None:
-    """Draws ``count`` states of each split and writes their poses."""
-    poses = {split: draw_poses(task, split, 0, count) for split in SPLITS}
-    np.savez_compressed(path, digest=np.int64(task.digest), **poses)
+def save_poses(task: FileTask, path: Path, count: int, check: Check | None = None) -> dict[str, np.ndarray]:
+    """Draws ``count`` states of each split and writes their poses.
+
+    A state that ``check`` refuses is drawn again, by the next generator of the same number; the others stay as they
+    are.
+
+    Returns:
+        For each split, how often each state was drawn again because of ``check``, ``[count]``.
+
+    Raises:
+        RuntimeError: as :func:`draw_poses`, and if ``check`` refuses ten draws of a state; nothing is written then.
+    """
+    drawn = {split: _draw(task, split, 0, count, check) for split in SPLITS}
+    np.savez_compressed(path, digest=np.int64(task.digest), **{split: poses for split, (poses, _) in drawn.items()})
+    return {split: refusals for split, (_, refusals) in drawn.items()}
 
 
 def _check_some_settle(task: FileTask, away: np.ndarray, upright: np.ndarray, solved: np.ndarray, draws: int) -> None:
@@ -134,6 +166,7 @@ def _free(model: mujoco.MjModel) -> np.ndarray:
     return np.array([address for address in range(model.nq) if address not in robot])
 
 
-def _parts(scene: SceneBatch) -> tuple[np.ndarray, ...]:
-    free = _free(scene.model)
-    return scene.qpos[:, free], scene.batch.bind("mocap_pos"), scene.batch.bind("mocap_quat")
+def _poses(scene: SceneBatch) -> np.ndarray:
+    """``[n, P]`` float32 of every row as it is now."""
+    parts = scene.qpos[:, _free(scene.model)], scene.batch.bind("mocap_pos"), scene.batch.bind("mocap_quat")
+    return np.concatenate([part.reshape(scene.num_envs, -1) for part in parts], -1).astype(np.float32)

@@ -58,7 +58,8 @@ class Task(abc.ABC):
     def init_states(self, split: str, count: int = 50) -> np.ndarray:
         """Initial states ``[count, S]`` float64: settled, free of collisions, fixed by seed.
 
-        ``train`` and ``test`` are disjoint; a larger count extends a smaller one.
+        ``train`` and ``test`` are disjoint; a larger count extends a smaller one. Those stored beside a task file are
+        all solved by the scripted expert; states beyond them are drawn untried.
 
         Raises:
             ValueError: for an unknown split or a count below 1.

@@ -12,7 +12,7 @@ from worldenv_trl.scenes.entities import Primitive
 from worldenv_trl.scenes.entities.cookware import Stove
 from worldenv_trl.scenes.entities.storage import Cabinet, Microwave
 from worldenv_trl.scenes.skills.clearance import travel
-from worldenv_trl.scenes.skills.phase import CLOSE, FINGER_HALF, Phase, axes, body, half_turn, joint, tcp, upwards
+from worldenv_trl.scenes.skills.phase import CLOSE, FINGER_HALF, OPEN, Phase, axes, body, half_turn, joint, tcp, upwards
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.files import FileTask
@@ -49,7 +49,10 @@ def pull_open(task: FileTask, thing: str, part: str, again: int) -> list[Phase]:
 
 
 def push_closed(task: FileTask, thing: str, part: str, again: int) -> list[Phase]:
-    """Phases that push a drawer or a microwave's door closed with closed fingers."""
+    """Phases that push a drawer or a microwave's door closed with closed fingers.
+
+    They close on the way down: a closed hand high above looks, to a policy without memory, like one that still carries.
+    """
     if isinstance(task.entities[thing], Microwave):
         return _close_door(task, thing, again)
     cabinet = _fixture(task, thing, Cabinet, "pushed closed")
@@ -63,7 +66,7 @@ def push_closed(task: FileTask, thing: str, part: str, again: int) -> list[Phase
         return before(scene, gap=0.0) - _STOP * _outwards(scene, thing)
 
     work = Phase(pushed, CLOSE, tolerance=0.004, limit=40)
-    return _stroke(task, again, before, (0.015, 0.010), lambda s: _across(s, thing), work)
+    return _stroke(task, again, before, (0.015, 0.010), lambda s: _across(s, thing), work, on_the_way=OPEN)
 
 
 def _close_door(task: FileTask, thing: str, again: int) -> list[Phase]:
@@ -84,7 +87,7 @@ def _close_door(task: FileTask, thing: str, again: int) -> list[Phase]:
         return beside(scene, -0.25, high + height, 0.03)
 
     work = Phase(lambda s, m: beside(s, 0.30, high, 0.0), CLOSE, tolerance=0.004, limit=70)
-    return _stroke(task, again, before, (0.02, 0.012), _straight, work)
+    return _stroke(task, again, before, (0.02, 0.012), _straight, work, on_the_way=OPEN)
 
 
 def turn(task: FileTask, thing: str, again: int, on: bool = True) -> list[Phase]:
@@ -119,14 +122,16 @@ def _stroke(
     work: Phase,
     *,
     over: float = _OVER,
+    on_the_way: float = CLOSE,
     done: Callable[[SceneBatch], np.ndarray] | None = None,
 ) -> list[Phase]:
-    """Closed fingers travel to ``over`` the ``start(scene, height)``, go down, do the ``work`` and leave upwards.
+    """The hand travels to ``over`` the ``start(scene, height)``, goes down closed, does the ``work`` and leaves.
 
-    ``tolerances`` are those of the travel and of the way down; ``done`` is what must still hold on the way up.
+    ``on_the_way`` is what the gripper does on its travel; ``tolerances`` are those of the travel and of the way down;
+    ``done`` is what must still hold on the way up.
     """
     phases = [
-        Phase(lambda s, m: travel(s, task, start(s, over)), CLOSE, tolerance=tolerances[0], limit=40, yaw=yaw),
+        Phase(lambda s, m: travel(s, task, start(s, over)), on_the_way, tolerance=tolerances[0], limit=40, yaw=yaw),
         Phase(lambda s, m: start(s), CLOSE, tolerance=tolerances[1], limit=20),
         work,
         Phase(lambda s, m: m + upwards(0.10), CLOSE, tolerance=0.02, remember=tcp, still=done),

@@ -1,0 +1,33 @@
+"""Initial states are tried before they are stored."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import init_states
+from worldenv_trl.scenes import load_task
+from worldenv_trl.scenes.initial import draw_poses, states_from_poses
+
+TASK = "goal/open_the_top_drawer_and_put_the_bowl_inside"
+
+
+def test_a_bowl_between_bottle_and_drawer_is_refused_and_what_is_stored_instead_is_solved():
+    task = load_task(TASK)
+    first_draws = states_from_poses(task, draw_poses(task, "test", 22, 2))
+    stored = task.init_states("test")[22:24]
+    assert np.array_equal(first_draws[1], stored[1])
+    assert init_states.solved_by_expert(task, np.stack([first_draws[0], *stored])).tolist() == [False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"tasks": ("goal/no_such",)}, "unknown task 'goal/no_such'"),
+        ({"tasks": ("gaol",)}, "did you mean 'goal'"),
+        ({"count": 0}, "--count must be at least 1, got 0"),
+    ],
+)
+def test_what_cannot_be_drawn_is_named(settings, message):
+    with pytest.raises(SystemExit, match=message):
+        init_states.main(init_states.Settings(**settings))
