@@ -1,12 +1,7 @@
 from __future__ import annotations
 
 import errno
-import os
 import re
-import signal
-import subprocess
-import sys
-import textwrap
 import warnings
 
 import pytest
@@ -101,34 +96,6 @@ def test_groups_of_a_truncated_file_keep_their_shape(tmp_path):
             read = read_rollouts(cut)
         assert read.shape == (groups, 2, 20)
         assert_prefix(read.reshape(-1, 20), rollouts)
-
-
-def test_a_killed_process_leaves_what_it_wrote(tmp_path):
-    script = textwrap.dedent(
-        """
-        import sys, time, torch
-        from tensordict import TensorDict
-        from worldenv_trl.record import RolloutWriter
-        writer = RolloutWriter(sys.argv[1])
-        for index in range(100):
-            image = torch.randint(0, 256, (4, 16, 3, 64, 64), dtype=torch.uint8)
-            writer.write(TensorDict({"observation": {"image": image}}, [4, 16]))
-            print(index, flush=True)
-        """
-    )
-    target = tmp_path / "a.mcap"
-    process = subprocess.Popen([sys.executable, "-c", script, str(target)], stdout=subprocess.PIPE, text=True)
-    for line in process.stdout:
-        if int(line) == 5:
-            os.kill(process.pid, signal.SIGKILL)
-            break
-    process.wait()
-    assert not target.exists()
-    with pytest.raises(FileNotFoundError, match=r"unfinished recording is in .*a\.partial\.mcap"):
-        read_rollouts(target)
-    with pytest.warns(UserWarning, match="truncated"):
-        read = read_rollouts(tmp_path / "a.partial.mcap")
-    assert int(read[keys.MASK].sum()) >= 5 * 64
 
 
 def test_changed_bytes_lose_their_chunk_and_nothing_else(tmp_path):
