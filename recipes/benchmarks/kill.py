@@ -135,10 +135,16 @@ def partial_of(target: Path) -> Path:
     return target.with_name(f"{target.stem}_{_WORKER}.partial.mcap")
 
 
-def recovered(target: Path) -> TensorDict:
+def recovered(target: Path) -> TensorDict | list:
+    """The rollouts, or none if the kill came before the first flush."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that it is unfinished
-        return read_rollouts(partial_of(target))
+        try:
+            return read_rollouts(partial_of(target))
+        except ValueError as error:
+            if "holds no rollouts" not in str(error):
+                raise
+            return []
 
 
 def kill_recorders(kills: int, folder: Path, rows: int = 8, within: float = 2.0, seed: int = 0) -> Kills:
@@ -163,10 +169,10 @@ def kill_recorders(kills: int, folder: Path, rows: int = 8, within: float = 2.0,
     return found
 
 
-def _leading_steps(read: TensorDict, reference: list[TensorDict], rows: int) -> int:
+def _leading_steps(read: TensorDict | list, reference: list[TensorDict], rows: int) -> int:
     """How many steps of the env are in the file for every row and bit for bit, before the first one that is not."""
     whole = torch.zeros(rows, len(reference) + EPISODE_STEPS, dtype=torch.bool)
-    for rollout in read.unbind(0):
+    for rollout in read:
         row, first = int(rollout[keys.ROW][0]), int(rollout[keys.EPISODE][0]) * EPISODE_STEPS
         length = min(int(rollout[keys.MASK].sum()), len(reference) - first)  # the last one may not have been said
         if length > 0:

@@ -8,9 +8,19 @@ import pytest
 import torch
 from mcap.reader import make_reader
 from tensordict import NonTensorData, TensorDict
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
 
 from worldenv_trl import keys
-from worldenv_trl.record import RolloutWriter, mcap_file, read_attachments, read_metadata, read_rollouts, repair
+from worldenv_trl.record import (
+    RolloutWriter,
+    mcap_file,
+    read_attachments,
+    read_metadata,
+    read_rollouts,
+    recorded,
+    repair,
+)
 from worldenv_trl.record.mcap_file import McapFile
 from worldenv_trl.record.scan import McapScan
 
@@ -27,6 +37,27 @@ def make_rollouts(rows: int = 4, steps: int = 10, size: int = 32) -> TensorDict:
         },
         batch_size=[rows, steps],
     )
+
+
+class NoiseEnv(EnvBase):
+    """Rows that show noise."""
+
+    def __init__(self, rows: int) -> None:
+        super().__init__(batch_size=[rows])
+        shape = (rows, 3, 32, 32)
+        image = Bounded(0, 255, shape, dtype=torch.uint8, domain="discrete")
+        self.observation_spec = Composite({"observation": Composite(image=image, shape=[rows])}, shape=[rows])
+        self.action_spec, self.reward_spec = Unbounded([rows, 7]), Unbounded([rows, 1])
+
+    def _reset(self, tensordict=None):
+        return TensorDict({"observation": self.observation_spec["observation"].rand()}, self.batch_size)
+
+    def _step(self, tensordict):
+        flags = {name: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for name in ("done", "terminated")}
+        return self._reset().update({"reward": torch.zeros(*self.batch_size, 1), **flags})
+
+    def _set_seed(self, seed):
+        return seed
 
 
 def record(path, *rollouts: TensorDict) -> None:
@@ -62,7 +93,7 @@ def test_a_file_cut_anywhere_gives_its_complete_steps(tmp_path):
     assert all(count > share * 160 - 12 for count, share in zip(found, (0.3, 0.5, 0.7, 0.9), strict=True)), found
     only_summary_lost = tmp_path / "tail.mcap"
     only_summary_lost.write_bytes(data[:-20])
-    with pytest.warns(UserWarning, match="at least 0 more"):
+    with pytest.warns(UserWarning, match="160 complete steps were read, all that it announces"):
         assert assert_prefix(read_rollouts(only_summary_lost), rollouts) == 160
 
 
@@ -98,24 +129,56 @@ def test_groups_of_a_truncated_file_keep_their_shape(tmp_path):
         assert_prefix(read.reshape(-1, 20), rollouts)
 
 
-def test_changed_bytes_lose_their_chunk_and_nothing_else(tmp_path):
-    parts = make_rollouts(6).split(2)
-    with RolloutWriter(tmp_path / "a.mcap") as writer:
-        for part in parts:
-            writer.write(part)
+def test_changed_bytes_in_a_short_file_lose_one_rollout_and_nothing_else(tmp_path):
+    rollouts = make_rollouts(20)
+    record(tmp_path / "a.mcap", rollouts)
+    assert (tmp_path / "a.mcap").stat().st_size < 1e6
     data = bytearray((tmp_path / "a.mcap").read_bytes())
-    data[len(data) // 2] ^= 0x40  # in the second write
+    data[len(data) // 2] ^= 0x40
     (tmp_path / "a.mcap").write_bytes(data)
-    with pytest.warns(UserWarning, match=r"a\.mcap is damaged behind byte .*: 40 complete steps .* least 20 more"):
+    said = r"is damaged behind byte .*: 190 complete steps were read, at least 10 more of rollout 10 are missing"
+    with pytest.warns(UserWarning, match=said):
         read = read_rollouts(tmp_path / "a.mcap")
-    assert read[keys.MASK].sum(-1).tolist() == [10] * 4
-    for rows, part in ((slice(0, 2), parts[0]), (slice(2, 4), parts[2])):
-        assert torch.equal(read[rows][keys.IMAGE], part[keys.IMAGE])
-        assert torch.equal(read[rows][keys.ACTION], part[keys.ACTION])
+    others = torch.arange(20) != 10
+    assert read[keys.MASK].sum(-1).tolist() == [0 if row == 10 else 10 for row in range(20)]
+    for key in (keys.IMAGE, keys.ACTION, ("next", *keys.IMAGE), ("next", "reward")):
+        assert torch.equal(read[others][key], rollouts[others][key])
+    done = repair(tmp_path / "a.mcap")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = read_rollouts(done.target)
+    for key in (keys.IMAGE, keys.ACTION, keys.MASK):
+        assert torch.equal(again[key], read[key])
+
+
+def test_changed_bytes_of_a_recorder_cost_few_of_the_rows_that_run_side_by_side(tmp_path):
+    env = recorded(NoiseEnv(16), tmp_path / "a.mcap")
+    rollouts = env.rollout(12, break_when_any_done=False)
+    env.close()
+    chunks = McapScan(tmp_path / "a.mcap").chunks
+    data = bytearray((tmp_path / "a.mcap").read_bytes())
+    data[chunks[3].data.start + 50] ^= 0x40
+    (tmp_path / "a.mcap").write_bytes(data)
+    with pytest.warns(UserWarning, match="others of rollouts 6 to 7 are missing"):
+        read = read_rollouts(tmp_path / "a.mcap")
+    kept = read[keys.ROW][:, 0, 0]
+    assert kept.tolist() == [row for row in range(16) if row not in (6, 7)]
+    assert torch.equal(read["next", *keys.IMAGE], rollouts[kept]["next", *keys.IMAGE])
+
+
+def test_a_file_of_which_nothing_is_left_is_not_repaired(tmp_path):
+    record(tmp_path / "a.mcap", make_rollouts(3))
+    data = bytearray((tmp_path / "a.mcap").read_bytes())
+    for chunk in McapScan(tmp_path / "a.mcap").chunks:
+        data[chunk.data.start + 50] ^= 0x40
+    (tmp_path / "a.mcap").write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.mcap holds no complete .*nothing to save"):
+        repair(tmp_path / "a.mcap")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
 def test_a_file_whose_only_chunk_is_damaged_is_refused(tmp_path):
-    record(tmp_path / "a.mcap", make_rollouts())
+    record(tmp_path / "a.mcap", make_rollouts(1))
     data = bytearray((tmp_path / "a.mcap").read_bytes())
     data[len(data) // 2] ^= 0x40
     (tmp_path / "a.mcap").write_bytes(data)
@@ -128,14 +191,14 @@ def test_bytes_that_hide_where_a_record_ends_lose_one_chunk(tmp_path):
     with RolloutWriter(tmp_path / "a.mcap") as writer:
         for part in parts:
             writer.write(part)
-    chunk = McapScan(tmp_path / "a.mcap").chunks[1]
+    chunk = McapScan(tmp_path / "a.mcap").chunks[2]
     data = bytearray((tmp_path / "a.mcap").read_bytes())
-    data[chunk.position : chunk.position + 9] = b"\xff" * 9  # the head of the second chunk
+    data[chunk.position : chunk.position + 9] = b"\xff" * 9  # the head of the third chunk
     (tmp_path / "a.mcap").write_bytes(data)
-    with pytest.warns(UserWarning, match=r"is damaged between byte \d+ and byte \d+: 40 complete"):
+    with pytest.warns(UserWarning, match=r"is damaged between byte \d+ and byte \d+: 50 complete"):
         read = read_rollouts(tmp_path / "a.mcap")
-    assert read[keys.MASK].sum(-1).tolist() == [10] * 4
-    assert torch.equal(read[2:][keys.IMAGE], parts[2][keys.IMAGE])
+    assert read[keys.MASK].sum(-1).tolist() == [10, 10, 0, 10, 10, 10]
+    assert torch.equal(read[4:][keys.IMAGE], parts[2][keys.IMAGE])
 
 
 def test_repair_keeps_every_complete_message_and_the_damaged_file(tmp_path):
@@ -164,7 +227,7 @@ def test_repair_keeps_every_complete_message_and_the_damaged_file(tmp_path):
     with pytest.raises(ValueError, match="another name"):
         repair(cut, cut)
     (tmp_path / "empty.mcap").write_bytes(data[:400])
-    with pytest.raises(ValueError, match=r"no complete message|written by another"):
+    with pytest.raises(ValueError, match=r"no complete step|written by another"):
         repair(tmp_path / "empty.mcap")
 
 

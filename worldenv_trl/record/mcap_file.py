@@ -20,7 +20,7 @@ __all__ = ["PARTIAL_SUFFIX", "McapFile"]
 
 PARTIAL_SUFFIX = ".partial.mcap"
 FLUSH_SECONDS = 0.5
-_CHUNK_BYTES = 4 * 2**20  # most of a frame repeats its predecessor: larger chunks halve the file
+_CHUNK_BYTES = 4 * 2**20  # at most: rollouts have chunks of their own
 _RESERVE = 65536  # bytes that the end of a file needs
 
 
@@ -119,6 +119,10 @@ class McapFile:
         body = self.block(channel, np.array([time_ns]), np.array([rollout]), len(data))
         body[0] = np.frombuffer(data, np.uint8)
 
+    def end_chunk(self) -> None:
+        """Keeps what follows apart from what was written: damage to one of them does not cost the other."""
+        self._call(self._writer.end_chunk)
+
     @property
     def size(self) -> int:
         """Bytes on disk."""
@@ -129,8 +133,12 @@ class McapFile:
         self._call(self._writer.flush)
         self._flushed = time.monotonic()
 
+    @property
+    def flush_is_due(self) -> bool:
+        return time.monotonic() - self._flushed > FLUSH_SECONDS
+
     def flush_if_due(self) -> None:
-        if time.monotonic() - self._flushed > FLUSH_SECONDS:
+        if self.flush_is_due:
             self.flush()
 
     def _call(self, method, *arguments) -> Any:

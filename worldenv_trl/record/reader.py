@@ -74,7 +74,7 @@ def read_rollouts(
         if chosen is None or chosen[number]:
             parts += _read(recording, keep, wanted)
     if not parts:
-        lost = [recording.warning(0, 0) for recording in recordings if not recording.scan.intact]
+        lost = [recording.warning([], 0) for recording in recordings if not recording.scan.intact]
         asked = "" if rollouts is time is None else " that were asked for"
         raise ValueError(f"{path} holds no rollouts{asked}{': ' + lost[0] if lost else ''}")
     out = _join(parts, path)
@@ -116,7 +116,7 @@ def _read(recording: Recording, keep: Callable | None, wanted: Callable[[_Path],
     parts = recording.parts(keep, wanted)
     if not parts:
         return []
-    said = recording.warning(sum(part.done for part in parts), sum(expected))
+    said = recording.warning(parts, sum(expected))
     if said:
         warnings.warn(said, stacklevel=4)
     return parts

@@ -38,7 +38,7 @@ def repair(path: str | os.PathLike, target: str | os.PathLike | None = None, *, 
     Raises:
         FileNotFoundError: if there is no such file.
         FileExistsError: if the target exists and ``overwrite`` is False.
-        ValueError: if the file is no recording, or is whole, or holds no message.
+        ValueError: if the file is no recording, or is whole, or holds no complete step.
     """
     path = Path(path)
     if not path.is_file():
@@ -53,8 +53,9 @@ def repair(path: str | os.PathLike, target: str | os.PathLike | None = None, *, 
     count = sum(map(len, opened))
     if scan.intact:
         raise ValueError(f"{path} is whole: there is nothing to repair")
-    if not count:
-        raise ValueError(f"{path} holds no complete message: there is nothing to save")
+    if not sum(part.done for part in recording.parts(wanted=lambda _: False)):
+        lost = f": it {scan.losses[0]}" if scan.losses else ""
+        raise ValueError(f"{path} holds no complete step{lost}; there is nothing to save")
     file = McapFile(target, overwrite=overwrite)
     try:
         for record in scan.metadata:
@@ -72,6 +73,7 @@ def repair(path: str | os.PathLike, target: str | os.PathLike | None = None, *, 
                     channels[number] = file.channel(channel.topic, schema.name, schema.data)
             for number, sequence, time, data in messages:
                 file.add(channels[number], time, data, sequence)
+            file.end_chunk()
     except BaseException:
         file.abort()
         file.partial.unlink(missing_ok=True)
