@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import errno
 import re
 import warnings
 
@@ -14,7 +13,6 @@ from torchrl.envs import EnvBase
 from worldenv_trl import keys
 from worldenv_trl.record import (
     RolloutWriter,
-    mcap_file,
     read_attachments,
     read_metadata,
     read_rollouts,
@@ -231,66 +229,6 @@ def test_repair_keeps_every_complete_message_and_the_damaged_file(tmp_path):
         repair(tmp_path / "empty.mcap")
 
 
-def test_a_disk_that_fills_up_while_writing_leaves_what_is_complete(tmp_path, monkeypatch):
-    rollouts = make_rollouts(4, 40, 64)
-    record(tmp_path / "a.mcap", rollouts[:1])
-    writer = RolloutWriter(tmp_path / "a.mcap", overwrite=True)
-    writer.write(rollouts[:2])
-    real, left = writer._file._writer._stream.write, 100_000
-
-    class Full:
-        def write(self, data):
-            nonlocal left
-            if len(data) > left:
-                real(data[:left])
-                raise OSError(errno.ENOSPC, "No space left on device")
-            left -= len(data)
-            return real(data)
-
-        def __getattr__(self, name):
-            return getattr(writer._file._file, name)
-
-    writer._file._writer._stream = Full()
-    with pytest.raises(OSError, match=r"a\.mcap could not be written: the disk is full.*a\.partial\.mcap"):
-        writer.write(rollouts[2:])
-    with pytest.raises(ValueError, match="closed"):
-        writer.write(rollouts[2:])
-    writer.close()
-    assert len(read_rollouts(tmp_path / "a.mcap")) == 1  # the good file is untouched
-    with pytest.warns(UserWarning, match="truncated"):
-        read = read_rollouts(tmp_path / "a.partial.mcap")
-    assert assert_prefix(read, rollouts) >= 80
-
-
-def test_two_writers_on_one_path_are_refused(tmp_path):
-    with RolloutWriter(tmp_path / "a.mcap") as writer:
-        for overwrite in (False, True):
-            with pytest.raises(FileExistsError, match=r"a\.mcap is being written by another writer"):
-                RolloutWriter(tmp_path / "a.mcap", overwrite=overwrite)
-        writer.write(make_rollouts(2))
-    assert len(read_rollouts(tmp_path / "a.mcap")) == 2
-
-
-def test_an_unfinished_recording_is_not_overwritten_by_accident(tmp_path):
-    with pytest.raises(RuntimeError, match="stop"), RolloutWriter(tmp_path / "a.mcap") as writer:
-        writer.write(make_rollouts(2))
-        raise RuntimeError("stop")
-    with pytest.raises(FileExistsError, match=r"unfinished recording is in .*recipes/repair\.py"):
-        RolloutWriter(tmp_path / "a.mcap")
-    assert len(read_rollouts(tmp_path / "a.partial.mcap")) == 2
-    RolloutWriter(tmp_path / "a.mcap", overwrite=True).close()
-
-
-def test_a_file_that_appears_meanwhile_is_kept(tmp_path):
-    writer = RolloutWriter(tmp_path / "a.mcap")
-    writer.write(make_rollouts(2))
-    (tmp_path / "a.mcap").write_bytes(b"precious")
-    with pytest.raises(FileExistsError, match="overwrite=True"):
-        writer.close()
-    assert (tmp_path / "a.mcap").read_bytes() == b"precious"
-    assert len(read_rollouts(tmp_path / "a.partial.mcap")) == 2
-
-
 def test_a_missing_channel_is_named(tmp_path):
     record(tmp_path / "a.mcap", make_rollouts(2))
     for topic, said in (("/step", "0 of 20 steps"), ("/observation/image", "lacks images on /observation/image")):
@@ -347,35 +285,6 @@ def test_a_recording_without_rollouts_is_refused(tmp_path):
     record(tmp_path / "a.mcap")
     with pytest.raises(ValueError, match="holds no rollouts"):
         read_rollouts(tmp_path / "a.mcap")
-
-
-def test_a_file_is_replaced_only_when_asked(tmp_path):
-    record(tmp_path / "a.mcap", make_rollouts(1))
-    with pytest.raises(FileExistsError, match="overwrite=True"):
-        RolloutWriter(tmp_path / "a.mcap")
-    with RolloutWriter(tmp_path / "a.mcap", overwrite=True) as writer:
-        writer.write(make_rollouts(2))
-        assert len(read_rollouts(tmp_path / "a.mcap")) == 1  # the old file stays until the new one is complete
-    assert len(read_rollouts(tmp_path / "a.mcap")) == 2
-
-
-def test_an_exception_leaves_the_partial_file_and_no_final_one(tmp_path):
-    with pytest.raises(RuntimeError, match="stop"), RolloutWriter(tmp_path / "a.mcap") as writer:
-        writer.write(make_rollouts(2))
-        raise RuntimeError("stop")
-    assert not (tmp_path / "a.mcap").exists()
-    assert len(read_rollouts(tmp_path / "a.partial.mcap")) == 2
-
-
-def test_a_full_disk_is_noticed_before_writing(tmp_path, monkeypatch):
-    writer = RolloutWriter(tmp_path / "a.mcap")
-    usage = type("Usage", (), {"free": 100_000})
-    monkeypatch.setattr(mcap_file.shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(OSError, match=r"MiB free: make room"):
-        writer.write(make_rollouts(8))
-    writer.write(make_rollouts(1, 1, 16))
-    writer.close()
-    assert len(read_rollouts(tmp_path / "a.mcap")) == 1
 
 
 @pytest.mark.parametrize(

@@ -257,6 +257,16 @@ class Recording:
                 )
         return infos
 
+    def entries(self) -> set[_Path]:
+        """The paths of all entries, as in the TensorDict."""
+        layouts = [part.layout for part in self.written] + [layout for layout, _ in self.streams]
+        found = {path for layout in layouts for path in layout.texts}
+        for layout in (*layouts, *self._annotations.values()):
+            for entry in (*layout.images, *layout.numbers):
+                found |= {entry.key} if entry.stored != "next" else set()
+                found |= {("next", *entry.key)} if entry.stored != "root" else set()
+        return found - {(TEXT,)}
+
     def count(self) -> int:
         """How many rollouts the file holds."""
         if not self.streams:

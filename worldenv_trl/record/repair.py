@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from worldenv_trl.record.mcap_file import McapFile
+from worldenv_trl.record.mcap_file import REPAIRED_SUFFIX, McapFile
 from worldenv_trl.record.recording import Recording
 from worldenv_trl.record.writer import FORMAT
 
@@ -46,7 +46,7 @@ def repair(path: str | os.PathLike, target: str | os.PathLike | None = None, *, 
     recording = Recording(path)
     scan = recording.scan
     name = path.name.removesuffix(".mcap").removesuffix(".partial")
-    target = path.with_name(f"{name}.repaired.mcap") if target is None else Path(target)
+    target = path.with_name(f"{name}{REPAIRED_SUFFIX}") if target is None else Path(target)
     if target.resolve() == path.resolve():
         raise ValueError(f"the repaired file must have another name than {path}: the damaged one is kept")
     opened = [list(scan.messages(chunk)) for chunk in scan.chunks]
