@@ -215,6 +215,8 @@ def _require_file(path: str | os.PathLike) -> Path:
     path = Path(path)
     if path.is_file():
         return path
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: name one recording")
     partial = path.with_name(path.stem + PARTIAL_SUFFIX)
     hint = f"; an unfinished recording is in {partial}" if partial.exists() else ""
     raise FileNotFoundError(f"there is no file {path}{hint}")
