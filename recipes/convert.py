@@ -13,6 +13,7 @@ from pathlib import Path
 
 import tyro
 
+from command_line import one_line_errors
 from worldenv_trl.data import hdf5_to_mcap, read_lerobot, write_lerobot
 from worldenv_trl.record import RolloutWriter, read_rollouts
 
@@ -31,23 +32,30 @@ class Options:
     """Replace the target."""
 
 
+@one_line_errors
 def main(options: Options) -> int:
     source, target = options.source, options.target
-    try:
-        if source.suffix == ".mcap":
-            rollouts = read_rollouts(source)
-            write_lerobot(rollouts, target, video=options.video, overwrite=options.overwrite)
-            count = rollouts.shape[:-1].numel()
-        elif source.suffix in (".hdf5", ".h5"):
-            count = hdf5_to_mcap(source, target, alignment=options.alignment, overwrite=options.overwrite)
-        else:
-            rollouts = read_lerobot(source)
-            with RolloutWriter(target, metadata={"source": source.name}, overwrite=options.overwrite) as writer:
-                writer.write(rollouts)
-            count = len(rollouts)
-    except (ValueError, OSError, ImportError) as error:
-        print(error, file=sys.stderr)
-        return 1
+    if not source.exists():
+        raise FileNotFoundError(f"there is no {'file' if source.suffix else 'folder'} {source}")
+    if source.is_dir() and not (source / "meta").exists() and any(source.glob("*.mcap")):
+        raise ValueError(f"{source} is a folder of recordings: convert them one by one")
+    if source.is_file() and source.suffix not in (".mcap", ".hdf5", ".h5"):
+        raise ValueError(f"{source} is neither a recording (.mcap), an HDF5 file (.hdf5, .h5) nor a LeRobot folder")
+    if source.suffix == ".mcap" and target.suffix in (".mcap", ".hdf5", ".h5"):
+        raise ValueError(f"a recording becomes a LeRobot folder: give a folder's name instead of {target}")
+    if source.suffix != ".mcap" and target.suffix != ".mcap":
+        raise ValueError(f"{source} becomes a recording: give a name that ends in .mcap instead of {target}")
+    if source.suffix == ".mcap":
+        rollouts = read_rollouts(source)
+        write_lerobot(rollouts, target, video=options.video, overwrite=options.overwrite)
+        count = rollouts.shape[:-1].numel()
+    elif source.suffix in (".hdf5", ".h5"):
+        count = hdf5_to_mcap(source, target, alignment=options.alignment, overwrite=options.overwrite)
+    else:
+        rollouts = read_lerobot(source)
+        with RolloutWriter(target, metadata={"source": source.name}, overwrite=options.overwrite) as writer:
+            writer.write(rollouts)
+        count = len(rollouts)
     print(f"{target}: {count} rollouts")
     return 0
 

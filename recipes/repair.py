@@ -12,6 +12,7 @@ from pathlib import Path
 
 import tyro
 
+from command_line import in_options
 from worldenv_trl.record import list_rollouts, repair
 
 
@@ -24,12 +25,17 @@ class Options:
 
 
 def main(options: Options) -> int:
+    if not options.files:
+        print("error: name at least one recording to repair", file=sys.stderr)
+        return 1
     failed = 0
     for path in options.files:
         try:
+            if path.is_dir():
+                raise ValueError(f"{path} is a folder: name the recordings in it")
             done = repair(path, overwrite=options.overwrite)
         except (ValueError, OSError) as error:
-            print(error, file=sys.stderr)
+            print(f"error: {in_options(error)}", file=sys.stderr)
             failed += 1
             continue
         with warnings.catch_warnings():

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import tyro
 
+from command_line import one_line_errors
 from worldenv_trl.policies import OFTPolicy, laplace_actor
 from worldenv_trl.pretrained import CONFIG_NAME
 from worldenv_trl.record import model_hash, parse_edit, read_metadata, replay
@@ -57,15 +58,8 @@ class Options:
     """Replace files that exist."""
 
 
+@one_line_errors
 def main(options: Options) -> int:
-    try:
-        return _replay(options)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-
-
-def _replay(options: Options) -> int:
     if options.json is not None and str(options.json) != "-" and options.json.exists() and not options.overwrite:
         raise FileExistsError(f"{options.json} exists: pass --overwrite or another name")
     metadata = read_metadata(options.file)

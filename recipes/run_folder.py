@@ -1,7 +1,8 @@
 """One folder per run: what every stage reads from and writes to.
 
 ``checkpoints/`` learned parts, ``rollouts/*.mcap`` logged rollouts, ``metrics.jsonl`` one line a measurement,
-``plots/*.png``, ``config.yaml`` the exact settings, ``stages/`` one marker per finished stage.
+``plots/*.png``, ``config.yaml`` the exact settings, ``versions.json`` the packages it ran with, ``stages/`` one marker
+per finished stage, ``report.html``.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+
+from worldenv_trl.report import machine_versions
 
 MIN_FREE_GB = 1.0
 
@@ -89,6 +92,18 @@ class RunFolder:
         for name in ("checkpoints", "rollouts", "plots", "stages"):
             (self.path / name).mkdir(exist_ok=True)
         _write_atomically(stored, yaml.safe_dump(new, sort_keys=False))
+        self._note_versions()
+
+    def _note_versions(self) -> None:
+        """Adds what runs now to ``versions.json`` if it is not what ran last."""
+        path = self.path / "versions.json"
+        try:
+            noted = list(json.loads(path.read_text()))
+        except (OSError, ValueError, TypeError):
+            noted = []
+        now = machine_versions()
+        if not noted or noted[-1] != now:
+            _write_atomically(path, json.dumps([*noted, now], indent=1) + "\n")
 
     def done(self, stage: str) -> bool:
         return (self.path / "stages" / stage).exists()

@@ -18,6 +18,7 @@ from typing import Literal
 
 import tyro
 
+from command_line import one_line_errors
 from worldenv_trl.record.viewers_foxglove import foxglove_layout
 from worldenv_trl.record.viewers_rerun import rerun_recording
 
@@ -37,19 +38,18 @@ class Options:
     """Replace a file that exists."""
 
 
+@one_line_errors
 def main(options: Options) -> int:
-    try:
-        if options.save is not None and options.save.exists() and not options.overwrite:
-            raise FileExistsError(f"{options.save} exists: pass --overwrite or another name")
-        return _foxglove(options) if options.viewer == "foxglove" else _rerun(options)
-    except (ValueError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    if options.file.is_dir():
+        raise ValueError(f"{options.file} is a folder: name one recording to show")
+    if not options.file.exists():
+        raise FileNotFoundError(f"there is no file {options.file}")
+    if options.save is not None and options.save.exists() and not options.overwrite:
+        raise FileExistsError(f"{options.save} exists: pass --overwrite or another name")
+    return _foxglove(options) if options.viewer == "foxglove" else _rerun(options)
 
 
 def _rerun(options: Options) -> int:
-    if not options.file.exists():
-        raise FileNotFoundError(f"there is no file {options.file}")
     if options.save is None and not has_display():
         raise OSError("there is no display to open a window on: pass --save rollouts.rrd and open that elsewhere")
     recording = rerun_recording(options.file, options.rollout or slice(MOST))

@@ -25,6 +25,7 @@ import demonstrate
 import evaluate
 import explore
 import post_train
+import report
 import sft
 import train_reflector
 import train_world_model
@@ -76,7 +77,7 @@ def stages(config: WorldEnvConfig) -> list[Stage]:
 
 
 def run_all(config: WorldEnvConfig) -> None:
-    """Runs what is not finished yet, then prints the table and writes the plots."""
+    """Runs what is not finished yet, then prints the table and writes the plots and the report."""
     folder = _open(config)
     for stage in stages(config):
         if _finished(stage, folder):
@@ -85,6 +86,12 @@ def run_all(config: WorldEnvConfig) -> None:
             _run(stage, config, folder)
     plot_run(folder.path)
     print(summary_table(folder.path))
+    episodes = max(min(config.evaluate.episodes_per_task // 5, report.Report.episodes_per_task), 1)
+    try:
+        report.write(report.Report(folder.path, episodes_per_task=episodes, num_threads=config.num_threads))
+    except Exception as error:  # the run itself is whole
+        again = f"python recipes/report.py {folder.path}"
+        print(f"warning: the report could not be written ({error}); after a remedy: {again}", file=sys.stderr)
 
 
 def run_single(kind: str) -> None:

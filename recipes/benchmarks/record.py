@@ -1,20 +1,13 @@
-"""What recording costs and keeps: ``python recipes/benchmarks/record.py [--kills 50]``.
+"""What recording costs: ``python recipes/benchmarks/record.py``.
 
-Overhead of a recorder on TabletopEnv, sizes, write and read rates, and what is left of recordings whose process was
-killed (SIGKILL) at a random moment.
+Overhead of a recorder on TabletopEnv, sizes, write and read rates.
 """
 
 from __future__ import annotations
 
-import os
-import random
-import signal
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,8 +31,6 @@ class Benchmark:
     image_size: int = 64
     steps: int = 30
     repeats: int = 8
-    kills: int = 50
-    """Processes that are killed while they write."""
     num_threads: int = 1
     """Threads of physics and rendering."""
 
@@ -140,50 +131,6 @@ def rates(settings: Benchmark, rollouts: TensorDict, folder: Path) -> None:
     report(f"one rollout of {len(rollouts)}, read", "ms", steps)
 
 
-_WRITER = """
-import sys, time, torch
-from tensordict import TensorDict
-from worldenv_trl.record import RolloutWriter
-generator = torch.Generator().manual_seed(int(sys.argv[2]))
-writer = RolloutWriter(sys.argv[1])
-for number in range(10**6):
-    image = torch.randint(0, 256, (2, 9, 3, 64, 64), dtype=torch.uint8, generator=generator)
-    image[..., 8:] = 7
-    writer.write(TensorDict({"observation": {"image": image[:, :-1]}, "number": torch.full((2, 8, 1), number),
-        "next": {"observation": {"image": image[:, 1:]}}}, [2, 8]))
-    print(number, time.time(), flush=True)
-"""
-
-
-def kills(settings: Benchmark, folder: Path) -> None:
-    """Kills writers at random moments; every rollout that was flushed must be there, frame by frame."""
-    draw, lost, kept = random.Random(0), 0, []
-    for index in range(settings.kills):
-        target = folder / f"killed_{index}.mcap"
-        command = [sys.executable, "-W", "ignore", "-c", _WRITER, str(target), str(index)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-        process.stdout.readline()
-        time.sleep(draw.uniform(0, 0.4))
-        os.kill(process.pid, signal.SIGKILL)
-        said = process.stdout.read().splitlines()
-        process.wait()
-        finished = 1 + sum(len(line.split()) == 2 for line in said)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            read = read_rollouts(folder / f"killed_{index}.partial.mcap")
-        generator = torch.Generator().manual_seed(index)
-        for number in range(finished):
-            image = torch.randint(0, 256, (2, 9, 3, 64, 64), dtype=torch.uint8, generator=generator)
-            image[..., 8:] = 7
-            rows = read[2 * number : 2 * number + 2]
-            whole = len(rows) == 2 and bool(rows[keys.MASK].all()) and bool((rows["number"] == number).all())
-            whole = whole and torch.equal(rows[keys.IMAGE], image[:, :-1])
-            lost += not (whole and torch.equal(rows["next", *keys.IMAGE], image[:, 1:]))
-        kept.append(finished)
-        (folder / f"killed_{index}.partial.mcap").unlink()
-    print(f"{'kill -9 of a writing process':<58} {settings.kills:>9} times; of {sum(kept)} flushed writes {lost} lost")
-
-
 def main(settings: Benchmark) -> None:
     torch.set_num_threads(1)
     print(f"median of {settings.repeats} [range]")
@@ -191,7 +138,6 @@ def main(settings: Benchmark) -> None:
         folder = Path(name)
         rollouts = overhead(settings, folder)
         rates(settings, rollouts, folder)
-        kills(settings, folder)
 
 
 if __name__ == "__main__":

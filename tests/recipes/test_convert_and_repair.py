@@ -14,7 +14,7 @@ def make_rollouts() -> TensorDict:
     image = torch.randint(0, 256, (3, 6, 3, 16, 16), dtype=torch.uint8)
     observed = [{"observation": {"image": image[:, part]}} for part in (slice(0, -1), slice(1, None))]
     td = TensorDict({**observed[0], keys.ACTION: torch.randn(3, 5, 7), "next": observed[1]}, [3, 5])
-    return td.set(keys.INSTRUCTION, "do it")
+    return td.set(keys.INSTRUCTION, "do it").set(("next", keys.INSTRUCTION), "do it")
 
 
 def test_recordings_go_to_lerobot_and_back(tmp_path, capsys):
@@ -25,10 +25,11 @@ def test_recordings_go_to_lerobot_and_back(tmp_path, capsys):
     assert convert.main(convert.Options(tmp_path / "set", tmp_path / "b.mcap")) == 0
     assert "3 rollouts" in capsys.readouterr().out
     first, second = read_rollouts(tmp_path / "a.mcap"), read_rollouts(tmp_path / "b.mcap")
+    assert set(first.keys(True, True)) == set(second.keys(True, True))
     for key in (keys.IMAGE, ("next", *keys.IMAGE), keys.ACTION, keys.MASK):
         assert torch.equal(first[key], second[key])
     assert convert.main(convert.Options(tmp_path / "a.mcap", tmp_path / "set")) == 1
-    assert "overwrite=True" in capsys.readouterr().err
+    assert "pass --overwrite" in capsys.readouterr().err
 
 
 def test_repair_says_what_it_saved_and_what_it_could_not(tmp_path, capsys):

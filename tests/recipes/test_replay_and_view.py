@@ -58,7 +58,7 @@ def test_a_replay_is_printed_in_words_and_kept_as_json(run, tmp_path, capsys):
     assert json.loads((tmp_path / "r.json").read_text())["exact"] is True
     assert (run / "rollouts" / "real_rollout1_replay.mcap").exists()
     assert call(replay_recipe, run / "rollouts" / "real.mcap", "--rollout", 1) == 1
-    assert "exists: pass overwrite=True" in capsys.readouterr().err
+    assert "exists: pass --overwrite" in capsys.readouterr().err
 
 
 def test_the_recorded_world_model_is_found_among_the_checkpoints(run, tmp_path, capsys):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 
 import pytest
 import torch
+import yaml
 
 from config import GOAL_TASKS, PRESETS
 from parts import task_instructions
@@ -105,3 +107,34 @@ def test_a_file_is_no_run_folder_and_stays_as_it_is(tmp_path):
     with pytest.raises(SystemExit, match="is no run folder"):
         main(Report(path))
     assert path.read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        ("goal/open_the_drawer_of_yore", "the run's task 'goal/open_the_drawer_of_yore' is not one of this release"),
+        ("goal/put_the_bowl_on_the_plate", "the models of this run do not know goal/put_the_bowl_on_the_plate (number"),
+    ],
+)
+def test_tasks_that_have_changed_since_are_named_with_the_remedy(finished, tmp_path, capsys, task, message):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    settings = yaml.safe_load((run / "config.yaml").read_text()) | {"tasks": [task]}
+    (run / "config.yaml").write_text(yaml.safe_dump(settings))
+    page = report_of(run)
+    said = capsys.readouterr().out
+    assert f"warning: missing in the report: {message}" in said and "--no-models" in said
+    assert "<video" not in page and task in page
+
+
+def test_the_versions_of_the_run_are_shown_beside_those_of_the_report(finished, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    assert "<h3>Versions</h3>" in (page := report_of(run, models=False)) and "this report" not in page
+    (noted,) = json.loads((run / "versions.json").read_text())
+    assert {"python", "torch", "worldenv_trl", "mujoco"} <= set(noted)
+    (run / "versions.json").write_text(json.dumps([noted | {"torch": "1.2.3"}, noted | {"mujoco": "2.3.4"}]))
+    page = report_of(run, models=False)
+    assert all(words in page for words in ("1.2.3", "2.3.4", "continued with", "this report"))
+    (run / "versions.json").unlink()
+    assert "did not note its versions" in report_of(run, models=False)

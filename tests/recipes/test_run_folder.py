@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 
 import pytest
 
+import run_folder
 from config import PRESETS, SFT
 from run_folder import RunFolder
 
@@ -65,3 +67,10 @@ def test_missing_inputs_name_the_stage_that_makes_them(folder):
         folder.require_checkpoint("sft", "sft")
     with pytest.raises(FileNotFoundError, match="run the stage 'explore'"):
         folder.require_rollouts("explore", "explore")
+
+
+def test_versions_are_noted_once_and_again_when_they_change(config, monkeypatch):
+    for version in ("2.13.0", "2.13.0", "2.14.0"):
+        monkeypatch.setattr(run_folder, "machine_versions", lambda version=version: {"torch": version})
+        RunFolder(config.run_dir).open(config)
+    assert json.loads((config.run_dir / "versions.json").read_text()) == [{"torch": "2.13.0"}, {"torch": "2.14.0"}]

@@ -53,7 +53,7 @@ def test_steps_and_keys_are_chosen(tmp_path, monkeypatch):
     read = read_rollouts(tmp_path / "a.mcap", keys=[keys.ACTION, ("next", "reward")])
     assert set(read.keys(True, True)) == {keys.ACTION, ("next", "reward"), keys.MASK}
     assert torch.equal(read[keys.ACTION][0], rollouts[keys.ACTION][0])
-    with pytest.raises(ValueError, match="holds no entry rewards: it has"):
+    with pytest.raises(ValueError, match=r"holds no entry 'rewards': did you mean .*'reward'"):
         read_rollouts(tmp_path / "a.mcap", keys=["rewards"])
 
 
@@ -92,3 +92,30 @@ def test_annotations_come_back_with_their_rollouts(tmp_path):
     assert torch.equal(read[keys.ADVANTAGE][2, :1], advantage[1, :1])
     assert torch.equal(read[keys.CLIPPED][1, :3], clipped[0, :3])
     assert not read[keys.ADVANTAGE][~read[keys.MASK]].any()
+
+
+def test_a_folder_gives_neither_replays_nor_what_was_repaired_twice(tmp_path):
+    first, again = step_rollouts([6, 3, 1]), step_rollouts([6], seed=3)
+    write(tmp_path / "a.mcap", first)
+    with RolloutWriter(tmp_path / "b.mcap", metadata={"replay": {"source": "a.mcap"}}) as writer:
+        writer.write(again)
+    assert_same(read_rollouts(tmp_path), first)
+    assert len(list_rollouts(tmp_path)) == 3 and len(list_rollouts(tmp_path, replays=True)) == 4
+    assert_same(read_rollouts(tmp_path, replays=True)[3:], again)
+    assert_same(read_rollouts(tmp_path / "b.mcap"), again)
+    assert len(read_rollouts(str(tmp_path / "*.mcap"))) == 4
+    (tmp_path / "a.mcap").rename(tmp_path / "a.repaired.mcap")
+    (tmp_path / "a.mcap").write_bytes((tmp_path / "a.repaired.mcap").read_bytes()[:-30])
+    assert_same(read_rollouts(tmp_path), first)
+    (tmp_path / "a.mcap").unlink()
+    (tmp_path / "a.repaired.mcap").unlink()
+    with pytest.raises(FileNotFoundError, match="nothing but replays: pass replays=True"):
+        read_rollouts(tmp_path)
+
+
+def test_an_unknown_entry_is_named_with_those_that_are_close(tmp_path):
+    write(tmp_path / "a.mcap", step_rollouts([2]))
+    with pytest.raises(ValueError, match=r"holds no entry 'acton': did you mean 'action'\? It has "):
+        read_rollouts(tmp_path / "a.mcap", keys=["acton"])
+    with pytest.raises(ValueError, match=r"did you mean \('observation', 'image'\)"):
+        read_rollouts(tmp_path / "a.mcap", keys=[("observation", "images")])

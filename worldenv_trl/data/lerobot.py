@@ -85,7 +85,7 @@ def write_lerobot(
         for row, length in enumerate(lengths):
             if length:
                 writer.add({key: value[row] for key, value in flat.items()}, length, tasks.index(said[row]), said[row])
-        writer.finish(tasks, robot_type)
+        writer.finish(tasks, robot_type, [path for path in texts if path[-1] == INSTRUCTION])
         if folder.exists():
             old = folder.with_name(folder.name + ".old")
             os.replace(folder, old)
@@ -278,7 +278,7 @@ class _FolderWriter:
             write_video(path, parts, self.fps)
             parts.clear()
 
-    def finish(self, tasks: list[str], robot_type: str) -> None:
+    def finish(self, tasks: list[str], robot_type: str, said: list[_Path]) -> None:
         if not self.episodes:
             raise ValueError("the rollouts hold no executed step: there is nothing to write")
         self._end_file()
@@ -291,7 +291,9 @@ class _FolderWriter:
         pq.write_table(_tasks_table(pa, tasks), meta / "tasks.parquet")
         (meta / "stats.json").write_text(json.dumps(stats, indent=4))
         pq.write_table(pa.Table.from_pylist(self.final), self.root / FINAL)
-        (self.root / EXTRAS).write_text(json.dumps({"version": 1, "columns": self.columns}, indent=2))
+        (self.root / EXTRAS).write_text(
+            json.dumps({"version": 1, "columns": self.columns, "instructions": said}, indent=2)
+        )
         info = {
             "codebase_version": "v3.0",
             "robot_type": robot_type,

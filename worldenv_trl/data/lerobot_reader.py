@@ -62,8 +62,10 @@ def read_lerobot(folder: str | os.PathLike, *, episodes: Sequence[int] | None = 
     steps = int(lengths.max())
     out[MASK] = torch.arange(steps) < lengths.unsqueeze(-1)
     words = [(row.get("tasks") or [""])[0] for row in rows]
-    stack = NonTensorStack(*(NonTensorData(word, batch_size=[steps]) for word in words))
-    out.set(INSTRUCTION, NonTensorData(words[0], batch_size=[len(words), steps]) if len(set(words)) == 1 else stack)
+    for path in _instructions(folder):
+        each = [NonTensorData(word, batch_size=[steps]) for word in words]
+        same = len(set(words)) == 1
+        out.set(path, NonTensorData(words[0], batch_size=[len(words), steps]) if same else NonTensorStack(*each))
     return out
 
 
@@ -92,6 +94,13 @@ def _rows(pq: Any, folder: Path) -> Iterator[dict[str, Any]]:
     for file in files:
         names = [name for name in pq.read_schema(file).names if not name.startswith("stats/")]
         yield from pq.read_table(file, columns=names).to_pylist()
+
+
+def _instructions(folder: Path) -> list[tuple[str, ...]]:
+    """The entries that held the task in words when we wrote the folder."""
+    extras = folder / EXTRAS
+    noted = json.loads(extras.read_text()).get("instructions") if extras.is_file() else None
+    return [(INSTRUCTION,)] if noted is None else [tuple(path) for path in noted]
 
 
 def _columns(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:

@@ -16,12 +16,42 @@ import numpy as np
 
 from worldenv_trl.record.mcap_writer import McapWriter
 
-__all__ = ["PARTIAL_SUFFIX", "McapFile"]
+__all__ = ["PARTIAL_SUFFIX", "REPAIRED_SUFFIX", "McapFile", "check_target"]
 
-PARTIAL_SUFFIX = ".partial.mcap"
+PARTIAL_SUFFIX, REPAIRED_SUFFIX = ".partial.mcap", ".repaired.mcap"
 FLUSH_SECONDS = 0.5
-_CHUNK_BYTES = 4 * 2**20  # most of a frame repeats its predecessor: larger chunks halve the file
+_CHUNK_BYTES = 4 * 2**20  # at most: rollouts have chunks of their own
 _RESERVE = 65536  # bytes that the end of a file needs
+
+_BUSY = "{} is being written by another writer: choose another path"
+_UNFINISHED = "an unfinished recording is in {}: repair it with recipes/repair.py, or pass overwrite=True to replace it"
+_HINTS = {
+    errno.ENOSPC: ": the disk is full, make room",
+    errno.EDQUOT: ": your share of the disk is used up, make room",
+    errno.EFBIG: ": files may not become larger here (ulimit -f), raise the limit or record less into one file",
+}
+
+
+def check_target(path: Path, overwrite: bool) -> Path:
+    """Raises what :class:`McapFile` would raise for this path now; returns where the unfinished file will be."""
+    if path.suffix != ".mcap" or path.name.endswith(PARTIAL_SUFFIX):
+        raise ValueError(f"path must end in .mcap (not {PARTIAL_SUFFIX}), got {path}")
+    _check_free(path, overwrite)
+    partial = path.with_name(path.stem + PARTIAL_SUFFIX)
+    if partial.exists():
+        with open(partial, "rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except OSError as error:
+                raise FileExistsError(_BUSY.format(path)) from error
+            if not overwrite and os.fstat(file.fileno()).st_size:
+                raise FileExistsError(_UNFINISHED.format(partial))
+    return partial
+
+
+def _check_free(path: Path, overwrite: bool) -> None:
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists: pass overwrite=True to replace it")
 
 
 class McapFile:
@@ -38,12 +68,8 @@ class McapFile:
     """
 
     def __init__(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
-        self.path = Path(path)
-        if self.path.suffix != ".mcap" or self.path.name.endswith(PARTIAL_SUFFIX):
-            raise ValueError(f"path must end in .mcap (not {PARTIAL_SUFFIX}), got {self.path}")
-        self._overwrite = overwrite
-        self._check_free()
-        self.partial = self.path.with_name(self.path.stem + PARTIAL_SUFFIX)
+        self.path, self._overwrite = Path(path), overwrite
+        self.partial = check_target(self.path, overwrite)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._file = self._open_locked()
         self.closed = False
@@ -53,10 +79,6 @@ class McapFile:
         self._call(self._writer.start, "worldenv_trl")
         self.flush()
 
-    def _check_free(self) -> None:
-        if self.path.exists() and not self._overwrite:
-            raise FileExistsError(f"{self.path} exists: pass overwrite=True to replace it")
-
     def _open_locked(self):
         while True:
             known = self.partial.exists()
@@ -65,7 +87,7 @@ class McapFile:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 file.close()
-                raise FileExistsError(f"{self.path} is being written by another writer: choose another path") from error
+                raise FileExistsError(_BUSY.format(self.path)) from error
             try:
                 same = os.stat(self.partial).st_ino == os.fstat(file.fileno()).st_ino
             except FileNotFoundError:
@@ -75,10 +97,7 @@ class McapFile:
                 continue
             if known and file.tell() and not self._overwrite:
                 file.close()
-                raise FileExistsError(
-                    f"an unfinished recording is in {self.partial}: repair it with recipes/repair.py, or pass "
-                    "overwrite=True to replace it"
-                )
+                raise FileExistsError(_UNFINISHED.format(self.partial))
             file.truncate(0)
             file.seek(0)
             return file
@@ -119,6 +138,10 @@ class McapFile:
         body = self.block(channel, np.array([time_ns]), np.array([rollout]), len(data))
         body[0] = np.frombuffer(data, np.uint8)
 
+    def end_chunk(self) -> None:
+        """Keeps what follows apart from what was written: damage to one of them does not cost the other."""
+        self._call(self._writer.end_chunk)
+
     @property
     def size(self) -> int:
         """Bytes on disk."""
@@ -129,8 +152,12 @@ class McapFile:
         self._call(self._writer.flush)
         self._flushed = time.monotonic()
 
+    @property
+    def flush_is_due(self) -> bool:
+        return time.monotonic() - self._flushed > FLUSH_SECONDS
+
     def flush_if_due(self) -> None:
-        if time.monotonic() - self._flushed > FLUSH_SECONDS:
+        if self.flush_is_due:
             self.flush()
 
     def _call(self, method, *arguments) -> Any:
@@ -140,7 +167,7 @@ class McapFile:
             return method(*arguments)
         except OSError as error:
             self.abort()
-            hint = ": the disk is full, make room" if error.errno == errno.ENOSPC else ""
+            hint = _HINTS.get(error.errno, f" ({error.strerror})")
             raise OSError(
                 error.errno, f"{self.path} could not be written{hint}; what is complete is in {self.partial}"
             ) from error
@@ -162,7 +189,7 @@ class McapFile:
             return
         self.finish()
         try:
-            self._check_free()
+            _check_free(self.path, self._overwrite)
             os.replace(self.partial, self.path)
         finally:
             self._file.close()

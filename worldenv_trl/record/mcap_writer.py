@@ -59,6 +59,7 @@ class McapWriter:
         self._metadata: list[MetadataIndex] = []
         self._chunks: list[ChunkIndex] = []
         self._counts: dict[int, int] = {}
+        self._buffer = np.empty(2**20, np.uint8)
         self._begin_chunk()
 
     def start(self, library: str) -> None:
@@ -99,43 +100,54 @@ class McapWriter:
         return channel.id
 
     def block(self, channel: int, times: np.ndarray, sequences: np.ndarray, size: int) -> np.ndarray:
-        """Messages of a channel that all have ``size`` bytes; the caller fills the array that it gets, uint8 [n, size].
+        """Messages of a channel that all have ``size`` bytes; the caller fills the array that it gets, uint8 [n, size],
+        before anything else is added.
 
         Args:
             times: int64 [n], ns.
             sequences: [n], their sequence numbers.
         """
         if self._offset > self._chunk_size:
-            self._end_chunk()
-        records = np.empty((len(times), _HEAD.itemsize + size), np.uint8)
+            self.end_chunk()
+        start = self._offset
+        self._reserve(len(times) * (_HEAD.itemsize + size))
+        records = self._buffer[start : self._offset].reshape(len(times), -1)
         head = np.empty(len(times), _HEAD)
         head["opcode"], head["length"], head["channel"] = Opcode.MESSAGE, _HEAD.itemsize - 9 + size, channel
         head["sequence"], head["log_time"], head["publish_time"] = sequences, times, times
         records[:, : _HEAD.itemsize] = head.view(np.uint8).reshape(len(times), -1)
-        places = self._offset + records.shape[1] * np.arange(len(times))
+        places = start + records.shape[1] * np.arange(len(times))
         self._index.setdefault(channel, []).append(np.stack([times, places], -1))
-        self._parts.append(records)
-        self._offset += records.size
         return records[:, _HEAD.itemsize :]
 
     def flush(self) -> None:
         """Ends the chunk and hands everything to the stream's operating system."""
-        self._end_chunk()
+        self.end_chunk()
         self._stream.flush()
 
     def _append(self, record: bytes) -> None:
-        self._parts.append(record)
-        self._offset += len(record)
+        start = self._offset
+        self._reserve(len(record))
+        self._buffer[start : self._offset] = np.frombuffer(record, np.uint8)
+
+    def _reserve(self, size: int) -> None:
+        """Makes room in the chunk: in memory that is kept, since touching new memory takes as long as filling it."""
+        end = self._offset + size
+        if end > len(self._buffer):
+            larger = np.empty(max(end, 2 * len(self._buffer)), np.uint8)
+            larger[: self._offset] = self._buffer[: self._offset]
+            self._buffer = larger
+        self._offset = end
 
     def _begin_chunk(self) -> None:
-        self._parts: list[bytes | np.ndarray] = []
         self._index: dict[int, list[np.ndarray]] = {}  # of each channel: times and places [n, 2]
         self._offset = 0
 
-    def _end_chunk(self) -> None:
+    def end_chunk(self) -> None:
+        """Begins a new chunk: damage to a file costs the chunk that it hits."""
         if not self._index:
             return
-        data = b"".join(self._parts)
+        data = self._buffer[: self._offset]
         packed = self._compressor.compress(data)
         entries = {channel: np.concatenate(parts) for channel, parts in self._index.items()}
         chunk = Chunk(
@@ -173,7 +185,7 @@ class McapWriter:
 
     def finish(self) -> None:
         """Writes the index that ends a file."""
-        self._end_chunk()
+        self.end_chunk()
         self._stream.write(_bytes(DataEnd(data_section_crc=0)))
         start = self._stream.tell()
         groups: list[tuple[Opcode, list[McapRecord]]] = [

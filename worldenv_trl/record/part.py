@@ -29,7 +29,7 @@ class Part:
 
     ``numbers`` are theirs in the file, ``starts`` (ns) when they begin to play, ``lengths`` their entries, ``executed``
     the executed steps of each decision where frames past a stop have a topic of their own (None: as the step messages
-    say), ``done`` the entries that were found.
+    say), ``done`` the entries that were found, ``damaged`` the numbers of rollouts that lack some or all of theirs.
     """
 
     layout: Layout
@@ -44,6 +44,7 @@ class Part:
     file: Path
     values: dict[_Path, Tensor] = field(default_factory=dict)  # by (stored, *key), see :meth:`decode`
     done: int = 0
+    damaged: list[int] = field(default_factory=list)
 
     @property
     def rows(self) -> int:
@@ -91,6 +92,7 @@ class Part:
             if entry.stored == "last_of_frames" and wanted(entry.key):
                 self._fill_last(entry, have)
         self.done = sum(have)
+        self.damaged = [n for n, had, length in zip(self.numbers, have, self.lengths, strict=True) if had < length]
         if not complete:
             self._shorten(have)
 

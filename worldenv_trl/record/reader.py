@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import glob
 import os
 import warnings
@@ -14,7 +15,7 @@ from tensordict import NonTensorData, NonTensorStack, TensorDict
 from torch import Tensor
 
 from worldenv_trl.keys import EPISODE, MASK, ROW, SIM_STATE, TASK_ID
-from worldenv_trl.record.mcap_file import PARTIAL_SUFFIX
+from worldenv_trl.record.mcap_file import PARTIAL_SUFFIX, REPAIRED_SUFFIX
 from worldenv_trl.record.part import Part
 from worldenv_trl.record.recording import TEXT, Recording, RolloutInfo
 
@@ -32,6 +33,7 @@ def read_rollouts(
     time: tuple[float, float] | None = None,
     steps: slice | None = None,
     keys: Sequence[_Key] | None = None,
+    replays: bool = False,
 ) -> TensorDict:
     """The rollouts that were recorded into a file, all files of a folder or those of a glob.
 
@@ -41,7 +43,8 @@ def read_rollouts(
     the others, root and next values that were stored once share memory: clone them before writing in place.
 
     A file that was cut off or damaged gives, with a warning, of every rollout the steps before the first one that is
-    lost. Files of a folder that are still being written (``*.partial.mcap``) are left out.
+    lost. Of a folder are left out: files that are still being written (``*.partial.mcap``), damaged ones whose repaired
+    version lies beside them, and replays, which would count a rollout twice; a pattern or a name reads them.
 
     Args:
         path: file, folder (its ``*.mcap``, by name) or pattern.
@@ -52,6 +55,7 @@ def read_rollouts(
         time: only rollouts that play between these seconds of their file, as a viewer's time line shows them.
         steps: only this part of each rollout.
         keys: only these entries, named as in the TensorDict; the others are not decoded.
+        replays: of a folder, also what :func:`~worldenv_trl.record.replay` has written (``replay`` in its metadata).
 
     Returns:
         TensorDict [*B, T]; [R, T] when rollouts are chosen.
@@ -61,7 +65,7 @@ def read_rollouts(
         ValueError: for a file that is no MCAP, without messages that it should hold, or not written by this package
             or by a later release of it; for files whose entries differ; if ``task``, a rollout or a key is not in them.
     """
-    recordings = [Recording(file) for file in _files(path)]
+    recordings = _recordings(path, replays)
     if task is not None:
         for recording in recordings:
             _require_task(recording.path, recording.metadata, task)
@@ -74,23 +78,23 @@ def read_rollouts(
         if chosen is None or chosen[number]:
             parts += _read(recording, keep, wanted)
     if not parts:
-        lost = [recording.warning(0, 0) for recording in recordings if not recording.scan.intact]
+        lost = [recording.warning([], 0) for recording in recordings if not recording.scan.intact]
         asked = "" if rollouts is time is None else " that were asked for"
         raise ValueError(f"{path} holds no rollouts{asked}{': ' + lost[0] if lost else ''}")
     out = _join(parts, path)
     out = _of_task(out, task, path) if several else out
     if steps is not None:
         out = out[..., steps]
-    return out if keys is None else _selected(out, keys, path)
+    return out if keys is None else _selected(out, keys, recordings, path)
 
 
-def list_rollouts(path: str | os.PathLike) -> list[RolloutInfo]:
+def list_rollouts(path: str | os.PathLike, *, replays: bool = False) -> list[RolloutInfo]:
     """What each rollout is: file, number, time, entries, instruction, row. Frames are not decoded.
 
     Raises and warns as :func:`read_rollouts`.
     """
     infos: list[RolloutInfo] = []
-    for recording in map(Recording, _files(path)):
+    for recording in _recordings(path, replays):
         infos += recording.infos(_read(recording, None, lambda key: key in ((ROW,), (EPISODE,))))
     return infos
 
@@ -116,7 +120,7 @@ def _read(recording: Recording, keep: Callable | None, wanted: Callable[[_Path],
     parts = recording.parts(keep, wanted)
     if not parts:
         return []
-    said = recording.warning(sum(part.done for part in parts), sum(expected))
+    said = recording.warning(parts, sum(expected))
     if said:
         warnings.warn(said, stacklevel=4)
     return parts
@@ -163,21 +167,37 @@ def _keep(numbers: set[int] | None, time: tuple[float, float] | None) -> Callabl
     return keep
 
 
-def _selected(rollouts: TensorDict, keys: Sequence[_Key], path: str | os.PathLike) -> TensorDict:
+def _selected(rollouts: TensorDict, keys: Sequence[_Key], recordings: list[Recording], path) -> TensorDict:
     have = set(rollouts.keys(True, True))
     missing = [key for key in keys if (_path(key)[0] if len(_path(key)) == 1 else _path(key)) not in have]
     if missing:
-        raise ValueError(f"{path} holds no entry {missing[0]}: it has {', '.join(sorted(map(str, have)))}")
+        known = {"/".join(each): each[0] if len(each) == 1 else each for r in recordings for each in r.entries()}
+        close = difflib.get_close_matches("/".join(_path(missing[0])), known, n=3)
+        hint = f"did you mean {' or '.join(repr(known[name]) for name in close)}? It" if close else "it"
+        raise ValueError(
+            f"{path} holds no entry {missing[0]!r}: {hint} has {', '.join(sorted(map(repr, known.values())))}"
+        )
     return rollouts.select(*keys, MASK)
 
 
 # ------------------------------------------------------------------------------------------------- files
 
 
+def _recordings(path: str | os.PathLike, replays: bool) -> list[Recording]:
+    found = [Recording(file) for file in _files(path)]
+    if replays or not Path(path).is_dir():
+        return found
+    kept = [recording for recording in found if "replay" not in recording.metadata]
+    if not kept:
+        raise FileNotFoundError(f"the folder {path} holds nothing but replays: pass replays=True to read them")
+    return kept
+
+
 def _files(path: str | os.PathLike) -> list[Path]:
     target = Path(path)
     if target.is_dir():
         found = sorted(p for p in target.glob("*.mcap") if not p.name.endswith(PARTIAL_SUFFIX))
+        found = [p for p in found if not p.with_name(f"{p.stem}{REPAIRED_SUFFIX}").exists()]
         if not found:
             raise FileNotFoundError(f"there is no .mcap file in the folder {target}: record rollouts into it first")
         return found
@@ -195,6 +215,8 @@ def _require_file(path: str | os.PathLike) -> Path:
     path = Path(path)
     if path.is_file():
         return path
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: name one recording")
     partial = path.with_name(path.stem + PARTIAL_SUFFIX)
     hint = f"; an unfinished recording is in {partial}" if partial.exists() else ""
     raise FileNotFoundError(f"there is no file {path}{hint}")

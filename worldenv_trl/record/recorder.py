@@ -17,6 +17,7 @@ from torchrl.envs.transforms import Compose, MultiAction, Transform, Transformed
 
 from worldenv_trl.keys import EPISODE, ROW
 from worldenv_trl.record.layout import leaves, to_bytes
+from worldenv_trl.record.mcap_file import check_target
 from worldenv_trl.record.stream import RolloutStream
 
 if TYPE_CHECKING:
@@ -58,7 +59,8 @@ class Recorder(Transform):
         queue_size: env steps that may wait to be written.
 
     Raises:
-        ValueError, FileExistsError, OSError: as :class:`~worldenv_trl.record.RolloutWriter`, from the first step on.
+        ValueError, FileExistsError: as :class:`~worldenv_trl.record.RolloutWriter`, at once.
+        OSError: as there, from the first step on.
 
     Examples:
         >>> env = TransformedEnv(TabletopEnv("starter/open_the_top_drawer", 16), Recorder("runs/demo.mcap"))
@@ -88,6 +90,7 @@ class Recorder(Transform):
         self._exclude = {(key,) if isinstance(key, str) else tuple(key) for key in exclude}
         self._worker, self._queue_size = worker, queue_size
         self._forget()
+        check_target(self.path, overwrite)  # now, not after the first rollout
 
     def _forget(self) -> None:
         self._stream: RolloutStream | None = None

@@ -72,6 +72,7 @@ class Recording:
         self._annotations: dict[str, Layout] = {}
         self._time = self._number = 0
         self.repaired = False
+        self.damaged: set[int] = set()  # rollouts that lack steps, as far as :meth:`parts` has seen
         for record in records:
             self._note(record)
 
@@ -155,9 +156,13 @@ class Recording:
         if keep is not None:
             streamed = [part.select(self._kept(part, keep)) for part in streamed]
         parts = [part for part in (*written, *streamed) if part.rows]
+        self.damaged = set()
+        if self.streams and keep is None:  # how many there were is not written anywhere
+            self.damaged = set(range(max(found, default=-1))) - {n for part in streamed for n in part.numbers}
         for part in parts:
             part.decode(found, self.scan.intact and not self.repaired, wanted)
             self._annotate(part, found, wanted)
+            self.damaged |= set(part.damaged)
         return [part for part in parts if part.rows]
 
     @staticmethod
@@ -252,20 +257,46 @@ class Recording:
                 )
         return infos
 
+    def entries(self) -> set[_Path]:
+        """The paths of all entries, as in the TensorDict."""
+        layouts = [part.layout for part in self.written] + [layout for layout, _ in self.streams]
+        found = {path for layout in layouts for path in layout.texts}
+        for layout in (*layouts, *self._annotations.values()):
+            for entry in (*layout.images, *layout.numbers):
+                found |= {entry.key} if entry.stored != "next" else set()
+                found |= {("next", *entry.key)} if entry.stored != "root" else set()
+        return found - {(TEXT,)}
+
     def count(self) -> int:
         """How many rollouts the file holds."""
         if not self.streams:
             return self._number
         return sum(part.rows for part in self.parts(wanted=lambda _: False))
 
-    def warning(self, done: int, expected: int) -> str:
-        """What is missing, if anything, when ``done`` of ``expected`` entries were read."""
+    def warning(self, parts: Iterable[Part], expected: int) -> str:
+        """What is missing, if anything, when ``parts`` of ``expected`` entries were read."""
         if self.scan.intact:
             return ""
         lost = "; it ".join(dict.fromkeys(self.scan.losses))
-        return (
-            f"{self.path} {lost}: {done} complete steps were read, at least {max(expected - done, 0)} more are missing"
-        )
+        done = sum(part.done for part in parts)
+        said = f"{self.path} {lost}: {done} complete steps were read"
+        if self.damaged:
+            most = f"at least {expected - done} more" if expected > done else "others"
+            return (
+                f"{said}, {most} of rollout{'s' * (len(self.damaged) > 1)} {_ranges(sorted(self.damaged))} are missing"
+            )
+        return f"{said}, {'all that it announces' if self.written else 'and none before them is missing'}"
+
+
+def _ranges(numbers: list[int]) -> str:
+    """``3 to 5, 8``."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    return ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)
 
 
 def _end(part: Part, index: int) -> int:

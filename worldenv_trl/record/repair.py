@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from worldenv_trl.record.mcap_file import McapFile
+from worldenv_trl.record.mcap_file import REPAIRED_SUFFIX, McapFile
 from worldenv_trl.record.recording import Recording
 from worldenv_trl.record.writer import FORMAT
 
@@ -38,7 +38,7 @@ def repair(path: str | os.PathLike, target: str | os.PathLike | None = None, *, 
     Raises:
         FileNotFoundError: if there is no such file.
         FileExistsError: if the target exists and ``overwrite`` is False.
-        ValueError: if the file is no recording, or is whole, or holds no message.
+        ValueError: if the file is no recording, or is whole, or holds no complete step.
     """
     path = Path(path)
     if not path.is_file():
@@ -46,15 +46,16 @@ def repair(path: str | os.PathLike, target: str | os.PathLike | None = None, *, 
     recording = Recording(path)
     scan = recording.scan
     name = path.name.removesuffix(".mcap").removesuffix(".partial")
-    target = path.with_name(f"{name}.repaired.mcap") if target is None else Path(target)
+    target = path.with_name(f"{name}{REPAIRED_SUFFIX}") if target is None else Path(target)
     if target.resolve() == path.resolve():
         raise ValueError(f"the repaired file must have another name than {path}: the damaged one is kept")
     opened = [list(scan.messages(chunk)) for chunk in scan.chunks]
     count = sum(map(len, opened))
     if scan.intact:
         raise ValueError(f"{path} is whole: there is nothing to repair")
-    if not count:
-        raise ValueError(f"{path} holds no complete message: there is nothing to save")
+    if not sum(part.done for part in recording.parts(wanted=lambda _: False)):
+        lost = f": it {scan.losses[0]}" if scan.losses else ""
+        raise ValueError(f"{path} holds no complete step{lost}; there is nothing to save")
     file = McapFile(target, overwrite=overwrite)
     try:
         for record in scan.metadata:
@@ -72,6 +73,7 @@ def repair(path: str | os.PathLike, target: str | os.PathLike | None = None, *, 
                     channels[number] = file.channel(channel.topic, schema.name, schema.data)
             for number, sequence, time, data in messages:
                 file.add(channels[number], time, data, sequence)
+            file.end_chunk()
     except BaseException:
         file.abort()
         file.partial.unlink(missing_ok=True)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import queue
 import threading
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -45,6 +47,18 @@ __all__ = ["RolloutStream", "painted"]
 
 _Path = tuple[str, ...]
 _CLOSE = object()
+_BLOCK_BYTES = 8 * 2**20  # steps are written together, rollout by rollout: a third less time, a fifth less file
+_BLOCK_CHUNKS = 8  # of which damage to one place costs one
+
+
+class _Steps(NamedTuple):
+    """Entries [n, ...] of the rollouts ``numbers`` at ``steps`` [n]; the rollouts ``first`` begin with ``begun``."""
+
+    values: dict[_Path, Tensor]
+    numbers: np.ndarray
+    steps: np.ndarray
+    first: np.ndarray
+    begun: dict[_Path, Tensor]
 
 
 class RolloutStream:
@@ -88,6 +102,9 @@ class RolloutStream:
         self._said_of: list[int] = []  # of each rollout
         self._time = 0
         self._annotator = Annotator(self._file, f"{FORMAT}.annotation", self._length, self._step_time)
+        self._block: list[_Steps] = []
+        self._block_bytes = 0
+        self._lines: list[tuple[int, int, str, str]] = []  # text about rollouts of the block
         self._queue: queue.Queue = queue.Queue(queue_size)
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._work, name=f"recorder of {path.name}", daemon=True)
@@ -117,7 +134,7 @@ class RolloutStream:
         self._wait_for(lambda: self._annotator.write(entries, rollouts))
 
     def flush(self) -> None:
-        self._wait_for(self._file.flush)
+        self._wait_for(self._flush)
 
     def close(self) -> None:
         if self._thread.is_alive():
@@ -161,18 +178,26 @@ class RolloutStream:
             except queue.Empty:
                 job = None
             try:
-                if job is _CLOSE:
-                    if self._error is None:
-                        self._file.close()
-                    return
                 if self._error is None:
-                    if job is not None:
+                    if job is _CLOSE:
+                        self._write_block()
+                        self._file.close()
+                    elif job is not None:
                         job()
-                    self._file.flush_if_due()
+                    if job is not _CLOSE and self._file.flush_is_due:
+                        self._flush()
             except BaseException as error:
                 self._error = error
                 if not self._file.closed:
+                    with contextlib.suppress(Exception):  # what came before the error
+                        self._flush()
                     self._file.abort()
+            if job is _CLOSE:
+                return
+
+    def _flush(self) -> None:
+        self._write_block()
+        self._file.flush()
 
     def _write(
         self,
@@ -194,20 +219,49 @@ class RolloutStream:
                 f"{FORMAT}.stream", {"json": json.dumps({"layout": layout.to_json(), "prefix": ""})}
             )
             self._encoder = RolloutEncoder(self._file, layout, "")
+            entries = (*layout.numbers, *layout.images)
+            self._expected = [
+                (e, e.key if e.stored == "root" else ("next", *e.key), torch.Size(e.shape), e.torch_dtype)
+                for e in entries
+            ]
+            self._entry_bytes = sum(entry.nbytes for entry in entries)
         self._check(values)
         for number in numbers:
             if number == len(self._starts):
                 self._starts.append(self._time)
                 self._lengths.append(0)
                 self._time += (self._slot_steps + 1) * PERIOD_NS
-        beginning = fresh.nonzero().squeeze(-1)
-        if len(beginning):
-            first = [numbers[place] for place in beginning.tolist()]
-            self._encoder.reset(first, [self._starts[number] for number in first], begun)
-        self._encoder.steps(numbers, steps, [self._starts[number] for number in numbers], values)
-        for number in numbers:
             self._lengths[number] += 1
+        of = np.asarray(numbers, np.int64)
+        self._block.append(_Steps(values, of, np.asarray(steps, np.int64), of[fresh.numpy()], begun))
+        self._block_bytes += len(numbers) * self._entry_bytes
         self._report(values, numbers)
+        if self._block_bytes > _BLOCK_BYTES:
+            self._write_block()
+
+    def _write_block(self) -> None:
+        """Writes what has gathered rollout by rollout, in a few chunks."""
+        block, self._block, self._block_bytes = self._block, [], 0
+        if block:
+            numbers = np.concatenate([part.numbers for part in block])
+            steps = np.concatenate([part.steps for part in block])
+            order = np.argsort(numbers, kind="stable")  # in each rollout, steps follow each other
+            values = {key: _joined([part.values[key] for part in block], order) for key in block[0].values}
+            numbers, steps = numbers[order], steps[order]
+            first = np.concatenate([part.first for part in block])
+            beginning = [part.begun for part in block if len(part.first)]
+            begun = {key: torch.cat([each[key] for each in beginning]) for key in (beginning or [{}])[0]}
+            starts = np.asarray(self._starts, np.int64)
+            for chosen in _shares(numbers, _BLOCK_CHUNKS):
+                fresh = np.isin(first, numbers[chosen]).nonzero()[0]
+                if len(fresh):
+                    self._encoder.reset(first[fresh], starts[first[fresh]], {k: v[fresh] for k, v in begun.items()})
+                of = numbers[chosen]
+                self._encoder.steps(of, steps[chosen], starts[of], {key: v[chosen] for key, v in values.items()})
+                self._file.end_chunk()
+        lines, self._lines = self._lines, []
+        for line in lines:
+            self._encoder.say(*line)
 
     @property
     def _layout(self) -> Layout:
@@ -262,10 +316,9 @@ class RolloutStream:
 
     def _check(self, values: dict[_Path, Tensor]) -> None:
         """What the first step showed about the entries must hold for all."""
-        for entry in (*self._layout.numbers, *self._layout.images):
-            key = entry.key if entry.stored == "root" else ("next", *entry.key)
+        for entry, key, shape, dtype in self._expected:
             value = values.get(key)
-            if value is None or tuple(value.shape[1:]) != entry.shape or value.dtype != entry.torch_dtype:
+            if value is None or value.shape[1:] != shape or value.dtype != dtype:
                 found = "is missing" if value is None else f"is {value.dtype} {list(value.shape[1:])}"
                 raise ValueError(f"entry {key} {found}, it was {entry.dtype} {list(entry.shape)} when recording began")
             if entry.stored == "last_of_frames":
@@ -283,9 +336,8 @@ class RolloutStream:
         for index in cause.flatten().nonzero().squeeze(-1).tolist():
             number = numbers[index]
             words = "" if place is None else self._said[self._said_of[number]][place]
-            self._encoder.say(
-                number, self._step_time(number, self._lengths[number] - 1), words, TERMINATIONS[int(cause[index])]
-            )
+            at = self._step_time(number, self._lengths[number] - 1)
+            self._lines.append((number, at, words, TERMINATIONS[int(cause[index])]))
 
     def _length(self, number: int) -> int:
         if not 0 <= number < len(self._lengths):
@@ -301,6 +353,28 @@ def painted(maps: Tensor) -> Tensor:
     its shadow grey."""
     hand = torch.maximum(maps[..., 0, :, :], maps[..., 4, :, :]).maximum(0.4 * maps[..., 5, :, :])
     return (torch.maximum(maps[..., 1:4, :, :], hand.unsqueeze(-3)) * 255).round().to(torch.uint8)
+
+
+def _joined(parts: list[Tensor], order: np.ndarray) -> Tensor:
+    """Values [n, ...] of several steps in another order."""
+    count = len(parts[0])
+    if len(order) == len(parts) * count and (order.reshape(count, -1) == _by_row(len(parts), count)).all():
+        return torch.stack(parts, 1).flatten(0, 1)  # one copy instead of two
+    return torch.cat(parts)[torch.from_numpy(order)]
+
+
+def _by_row(steps: int, rows: int) -> np.ndarray:
+    return np.arange(rows)[:, None] + rows * np.arange(steps)
+
+
+def _shares(numbers: np.ndarray, most: int) -> Iterator[slice]:
+    """``numbers`` [n], in which equal ones stand together, in at most so many parts that do not divide them."""
+    ends = [*(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
+    begin = 0
+    for end in ends:
+        if end - begin >= len(numbers) / most or end == len(numbers):
+            yield slice(begin, end)
+            begin = end
 
 
 def _end(jobs: queue.Queue, thread: threading.Thread) -> None:

@@ -149,6 +149,7 @@ class RolloutWriter:
             self._write_row(index, {key: value[row] for key, value in flat.items()}, length)
             if said:
                 self._encoders[index].say(first + row, self._time - PERIOD_NS, said[row], _outcome(flat, row, length))
+            self._file.end_chunk()
             self._file.flush_if_due()
         self._raw_bytes += raw
         self._file.flush()

@@ -1,8 +1,19 @@
 """Plots, tables and the HTML report of a run folder."""
 
-from worldenv_trl.report.evidence import Clip, Evidence, RunRecord
+from worldenv_trl.report.evidence import Clip, Evidence, RunRecord, choose_clips, count_kinds, machine_versions
 from worldenv_trl.report.page import render_report, write_report
 from worldenv_trl.report.plots import plot_run
 from worldenv_trl.report.table import summary_table
 
-__all__ = ["Clip", "Evidence", "RunRecord", "plot_run", "render_report", "summary_table", "write_report"]
+__all__ = [
+    "Clip",
+    "Evidence",
+    "RunRecord",
+    "choose_clips",
+    "count_kinds",
+    "machine_versions",
+    "plot_run",
+    "render_report",
+    "summary_table",
+    "write_report",
+]

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from worldenv_trl.report.table import read_metrics
 
-__all__ = ["KINDS", "Clip", "Evidence", "RunRecord"]
+__all__ = ["KINDS", "Clip", "Evidence", "RunRecord", "choose_clips", "count_kinds", "machine_versions"]
 
 KINDS = {
     "failure": "The goal is not reached, and imagination agrees",
@@ -122,6 +123,8 @@ class RunRecord:
     config: dict[str, Any]
     versions: dict[str, str]
     seconds: dict[str, float]
+    run_versions: tuple[dict[str, str], ...] = ()
+    """What the run began with and, where they differ, what continued it; ``versions`` are this machine's."""
 
     @classmethod
     def read(cls, path: str | Path) -> RunRecord:
@@ -148,7 +151,7 @@ class RunRecord:
             raise ValueError(
                 f"{path / 'config.yaml'} holds no settings ({config}); the run that wrote it can write it again"
             )
-        return cls(path, lines, config, _versions(), seconds)
+        return cls(path, lines, config, machine_versions(), seconds, _noted_versions(path))
 
     def series(self, stage: str, key: str) -> tuple[list[float], list[float]]:
         """Steps and values of a logged quantity."""
@@ -159,14 +162,45 @@ class RunRecord:
         return [name for name in dict.fromkeys(line["stage"] for line in self.lines) if name.startswith(prefix)]
 
 
-def _versions() -> dict[str, str]:
+def _noted_versions(path: Path) -> tuple[dict[str, str], ...]:
+    try:
+        noted = json.loads((path / "versions.json").read_text())
+    except (OSError, ValueError):  # of a run before they were noted
+        return ()
+    return tuple(each for each in noted if isinstance(each, dict)) if isinstance(noted, list) else ()
+
+
+def machine_versions() -> dict[str, str]:
+    """Python, the packages that decide what a run comes to, here and now."""
     from importlib.metadata import PackageNotFoundError, version
     from platform import python_version
 
     found = {"python": python_version()}
-    for name in ("worldenv_trl", "torch", "torchrl", "tensordict", "mujoco", "av"):
+    for name in ("worldenv_trl", "torch", "torchrl", "tensordict", "mujoco", "dm-control", "numpy", "av"):
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found | {"threads": str(torch.get_num_threads())}
+    return found
+
+
+def choose_clips(shown: Sequence[Clip], count: int) -> list[Clip]:
+    """``count`` clips of each kind: those of the first one's policy first, tasks in turn."""
+    chosen = []
+    for kind in ("failure", "false stop", "missed stop", "success"):
+        turn: Counter[tuple[str, str]] = Counter()
+        ranked = []
+        for place, clip in enumerate(clip for clip in shown if clip.kind == kind):
+            turn[clip.policy, clip.task] += 1
+            ranked.append((clip.policy != shown[0].policy, turn[clip.policy, clip.task], place, clip))
+        chosen += [clip for *_, clip in sorted(ranked, key=lambda entry: entry[:3])[:count]]
+    return chosen
+
+
+def count_kinds(shown: Sequence[Clip], policy: str) -> dict[str, dict[str, int]]:
+    """How often each kind of episode occurs in each task."""
+    found: dict[str, Counter[str]] = {}
+    for clip in shown:
+        if clip.policy == policy:
+            found.setdefault(clip.task, Counter())[clip.kind] += 1
+    return {task: dict(kinds) for task, kinds in found.items()}

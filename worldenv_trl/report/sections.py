@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from html import escape
 from typing import Any
 
@@ -125,48 +126,16 @@ def honesty(record: RunRecord, evidence: Evidence | None) -> str:
     """The imagined-versus-real tables."""
     parts = []
     if evidence and evidence.honesty:
-        head = (
-            "policy",
-            "task",
-            "n",
-            "imagined, %",
-            "real, %",
-            "gap, points",
-            "precision",
-            "recall",
-            "F1",
-            "stop error",
-        )
-        rows = [
-            (escape(row["policy"]), escape(task_name(row["task"])), *_honest_cells(row), _steps(row))
-            for row in evidence.honesty
-        ]
         parts += [
             "<h3>Held-out contexts: the policy’s actions from the physics, imagined</h3>",
-            table(head, rows, words=2),
+            _honesty_table("policy", evidence.honesty),
         ]
     if evidence and evidence.waves:
-        head = (
-            "iteration",
-            "task",
-            "n",
-            "imagined, %",
-            "real, %",
-            "gap, points",
-            "precision",
-            "recall",
-            "F1",
-            "stop error",
-        )
-        rows = [
-            (row["iteration"], escape(task_name(row["task"])), *_honest_cells(row), _steps(row))
-            for row in evidence.waves
-        ]
         parts += [
             "<h3>What LOOP learned from: its imagined rollouts, executed in the physics</h3>",
             '<p class="say">The harder test: these actions were rewarded in imagination. A gap that grows from the '
             "first to the last iteration is a policy that learns the world model’s errors.</p>",
-            table(head, rows, words=2),
+            _honesty_table("iteration", evidence.waves),
         ]
     for stage in record.stages("post_train"):
         pairs = [
@@ -234,12 +203,11 @@ def settings(record: RunRecord, evidence: Evidence | None) -> str:
         else (f"{escape(name)} <small>(unfinished)</small>", "–", "–")
         for name in order
     ]
-    versions = [(escape(name), escape(value)) for name, value in record.versions.items()]
     parts = [
         '<div class="two"><div><h3>Stages</h3>',
         table(("stage", "time", "share"), stages) if stages else missing("No stage has run yet."),
-        "</div><div><h3>Versions of this report’s machine</h3>",
-        table(("package", "version"), versions),
+        "</div><div><h3>Versions</h3>",
+        _versions(record),
         "</div></div><h3>Config</h3>",
         f'<pre tabindex="0">{escape(yaml.safe_dump(record.config, sort_keys=False))}</pre>',
     ]
@@ -247,6 +215,18 @@ def settings(record: RunRecord, evidence: Evidence | None) -> str:
         notes = "".join(f"<li>{escape(note)}</li>" for note in evidence.notes)
         parts.append(f"<h3>How this was measured</h3><ul>{notes}</ul>")
     return section("config", "Config and versions", "What was run, and for how long.", *parts)
+
+
+def _versions(record: RunRecord) -> str:
+    """Of the run, of what continued it, and of this report where they differ."""
+    known = list(record.run_versions)
+    heads = ["the run", *["continued with"] * (len(known) - 1)] if known else []
+    if record.versions not in known:
+        known, heads = [*known, record.versions], [*heads, "this report"]
+    names = list(dict.fromkeys(name for each in known for name in each))
+    rows = [(escape(name), *(escape(str(each.get(name, "–"))) for each in known)) for name in names]
+    note = "" if record.run_versions else missing("Missing: the run did not note its versions.")
+    return table(("package", *heads), rows) + note
 
 
 def _absent(evidence: Evidence | None, what: str) -> str:
@@ -260,6 +240,15 @@ def interval_of_points(test: dict[str, Any]) -> str:
 
 def _rated(line: dict[str, Any]) -> str:
     return interval(line["success"], line["low"], line["high"])
+
+
+def _honesty_table(first: str, rows: Sequence[dict[str, Any]]) -> str:
+    """Figures of :func:`~worldenv_trl.metrics.honesty` by ``first`` and task."""
+    figures = ("imagined, %", "real, %", "gap, points", "precision", "recall", "F1", "stop error")
+    cells = [
+        (escape(str(row[first])), escape(task_name(row["task"])), *_honest_cells(row), _steps(row)) for row in rows
+    ]
+    return table((first, "task", "n", *figures), cells, words=2)
 
 
 def _honest_cells(row: dict[str, Any]) -> tuple[Any, ...]:

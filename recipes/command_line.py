@@ -1,0 +1,47 @@
+"""How the commands of this folder say what went wrong: in one line, in the words of their options."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec
+
+P = ParamSpec("P")
+
+_OPTIONS = (
+    ("pass overwrite=True", "pass --overwrite"),
+    ("or pass replays=True to read them", "name them one by one"),
+    ("pass replays=True to read them", "name them one by one"),
+    ("pass a policy, or an edit", "pass --policy, or an --edit"),
+    ("pass its world_model", "pass --world-model"),
+    ("pass a reflector, too", "pass --reflector, too"),
+    ("or another target", "or another --target"),
+)
+
+
+def one_line_errors(main: Callable[P, int | None]) -> Callable[P, int]:
+    """``main`` with errors and warnings as lines on stderr; returns 1 after an error."""
+
+    @wraps(main)
+    def run(*arguments: P.args, **options: P.kwargs) -> int:
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
+            try:
+                return main(*arguments, **options) or 0
+            except (ValueError, OSError, ImportError) as error:
+                print(f"error: {in_options(error)}", file=sys.stderr)
+                return 1
+
+    return run
+
+
+def in_options(error: Exception) -> str:
+    """What an error says, for someone who has options and no arguments."""
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        text = error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
+    for argument, option in _OPTIONS:
+        text = text.replace(argument, option)
+    return " ".join(text.split())

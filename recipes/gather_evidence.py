@@ -1,0 +1,211 @@
+"""What a report shows of a run's models: its policies on held-out initial states, in the physics and in imagination."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+
+from config import WorldEnvConfig
+from parts import load_policy, load_reflector, load_world_model
+from run_folder import RunFolder
+from two_worlds import TwoWorlds, first_success, honesty_of, imagine, judged, live, relive
+from worldenv_trl import keys
+from worldenv_trl.data import episodes_from_rollouts
+from worldenv_trl.metrics import honesty, moving_pixel_psnr
+from worldenv_trl.policies import laplace_actor
+from worldenv_trl.record import read_rollouts
+from worldenv_trl.reflectors import CompactReflector
+from worldenv_trl.report import Clip, Evidence, RunRecord, choose_clips, count_kinds
+from worldenv_trl.scenes import load_task
+from worldenv_trl.world_models import VideoWorldModel
+
+
+def gather(record: RunRecord, episodes_per_task: int, clips_per_kind: int, num_threads: int) -> Evidence:
+    """Everything that needs the run's models; what cannot be had is named in ``missing``.
+
+    Raises:
+        FileNotFoundError: for a checkpoint that is missing, naming the stage that makes it.
+        ValueError: for tasks that this release does not have, or has under other numbers than the models.
+    """
+    folder, config = RunFolder(record.path), read_config(record, num_threads)
+    models = [path.name for path in sorted((record.path / "checkpoints").glob("reflector*")) if path.is_dir()]
+    suffix = models[-1].removeprefix("reflector") if models else ""
+    world_model, reflector = load_world_model(folder, suffix), load_reflector(folder, suffix)
+    _check_tasks(record, config, world_model, reflector)
+    policies = [name for name in ("sft", f"post_train{suffix}") if folder.checkpoint(name).is_dir()]
+    if not policies:
+        raise FileNotFoundError("there is no checkpoint of a policy: run the stage 'sft' first")
+    missing = [] if len(policies) == 2 else ["the stage post_train has not finished: the policy before it is shown"]
+    worlds: dict[str, TwoWorlds] = {}
+    for name in policies:
+        print(f"{name}: {episodes_per_task} held-out episodes a task, in the physics and in imagination")
+        actor = laplace_actor(load_policy(folder, name, name).eval())
+        worlds[name] = imagine(world_model, reflector, live(config, actor, episodes_per_task))
+    rules = reflector.config
+    waves = []
+    for path in _waves(record, suffix):
+        try:
+            waves += _relived(config, path)
+        except ValueError as error:
+            missing.append(f"the wave {path.name} cannot be replayed: {short(error)}")
+    shown = [clip for name in reversed(policies) for clip in clips(worlds[name], name, config, rules.threshold)]
+    return Evidence(
+        clips=choose_clips(shown, clips_per_kind),
+        counts={name: count_kinds(shown, name) for name in policies},
+        honesty=[row for name in policies for row in _honesty_rows(worlds[name], name, config)],
+        waves=waves,
+        drift={name: honesty_of(worlds[name])["drift"] for name in policies},
+        scores=_frame_scores(list(worlds.values())),
+        rules={
+            "real": (rules.real_threshold, rules.real_consecutive),
+            "imagined": (rules.threshold, rules.consecutive),
+        },
+        episodes=len(worlds[policies[-1]].episodes),
+        missing=missing,
+        notes=[
+            f"Film strips, drift, calibration and confusion: the first {episodes_per_task} held-out initial "
+            "states of each task, greedy, to the step limit in the physics; the same actions imagined open loop.",
+            "Imagination's verdict is the reflector's stopping rule on imagined frames; the physics' is its goal.",
+            "Imagination parts from the physics where the mean colour of a patch, an eighth of the image wide, is off "
+            "by more than 40 of 255 for three steps in a row.",
+        ],
+    )
+
+
+def _check_tasks(
+    record: RunRecord, config: WorldEnvConfig, world_model: VideoWorldModel, reflector: CompactReflector
+) -> None:
+    """The models must know the tasks of the run by the numbers that this release gives them."""
+    numbers = {task: load_task(task).task_id for task in config.tasks}
+    known = {int(number) for number in world_model.config.cameras} & set(range(reflector.config.num_tasks))
+    if strange := [f"{task} (number {number})" for task, number in numbers.items() if number not in known]:
+        raise ValueError(
+            f"the models of this run do not know {', '.join(strange)}: task names or numbers have changed since. "
+            f"{_remedy(record)}"
+        )
+
+
+def _remedy(record: RunRecord) -> str:
+    made = record.run_versions[0].get("worldenv_trl") if record.run_versions else None
+    return f"Write the report with the release that made the run{f' ({made})' if made else ''}, or pass --no-models"
+
+
+def read_config(record: RunRecord, num_threads: int) -> WorldEnvConfig:
+    """The run's settings; one that this release does not know is left out.
+
+    Raises:
+        ValueError: naming a task that this release does not have.
+    """
+    config = dataclasses.replace(_filled(WorldEnvConfig(), record.config), run_dir=record.path, num_threads=num_threads)
+    for task in config.tasks:
+        try:
+            load_task(task)
+        except (ValueError, OSError) as error:
+            raise ValueError(
+                f"the run's task {task!r} is not one of this release ({error}). {_remedy(record)}"
+            ) from error
+    return config
+
+
+def _filled(settings: Any, values: dict[str, Any]) -> Any:
+    known = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    found = {}
+    for name, value in values.items():
+        if name in known and dataclasses.is_dataclass(known[name]):
+            found[name] = _filled(known[name], value)
+        elif name in known:
+            found[name] = tuple(value) if isinstance(value, list) else value
+    return dataclasses.replace(settings, **found)
+
+
+def clips(worlds: TwoWorlds, policy: str, config: WorldEnvConfig, threshold: float) -> list[Clip]:
+    """Every episode of a policy, in both worlds."""
+    names = {load_task(task).task_id: task for task in config.tasks}
+    frames, out = worlds.episodes["frames"], []
+    for row in range(len(worlds.episodes)):
+        steps = int(worlds.episodes["length"][row]) + 1
+        real, imagined = frames[row, :steps], worlds.imagined_frames[row, :steps]
+        psnr = moving_pixel_psnr(imagined, real, real[:1].expand_as(real)).clamp(max=60)
+        out.append(
+            Clip(
+                task=names[int(worlds.episodes[keys.TASK_ID][row])].split("/")[-1].replace("_", " "),
+                policy=policy,
+                context_id=int(worlds.episodes[keys.CONTEXT_ID][row]),
+                real_frames=real,
+                imagined_frames=imagined,
+                real_scores=worlds.real_scores[row, :steps],
+                imagined_scores=worlds.imagined_scores[row, :steps],
+                gripper=worlds.episodes["states"][row, :steps, 6],
+                moving_psnr=psnr,
+                reached=int(worlds.reached[row]),
+                imagined_stop=int(worlds.imagined_stop[row]),
+                threshold=threshold,
+            )
+        )
+    return out
+
+
+def _honesty_rows(worlds: TwoWorlds, policy: str, config: WorldEnvConfig) -> list[dict[str, Any]]:
+    imagined, real = worlds.outcomes()
+    rows = []
+    for task, chosen in _by_task(worlds.episodes, config):
+        figures = honesty(
+            imagined[chosen],
+            real[chosen],
+            imagined_steps=worlds.imagined_stop[chosen],
+            real_steps=worlds.reached[chosen],
+        )
+        rows.append({"policy": policy, "task": task} | figures)
+    return rows
+
+
+def _by_task(episodes: TensorDict, config: WorldEnvConfig) -> list[tuple[str, torch.Tensor]]:
+    number = episodes[keys.TASK_ID].squeeze(-1)
+    rows = {task: number == load_task(task).task_id for task in config.tasks}
+    return [("all", torch.ones_like(number, dtype=torch.bool)), *((t, r) for t, r in rows.items() if bool(r.any()))]
+
+
+def _waves(record: RunRecord, suffix: str) -> list[Path]:
+    """The logged waves of LOOP: the first and the last iteration."""
+    return sorted((record.path / "rollouts").glob(f"post_train{suffix}_[0-9][0-9][0-9].mcap"))
+
+
+def _relived(config: WorldEnvConfig, path: Path) -> list[dict[str, Any]]:
+    """Honesty of a wave of imagined rollouts, whose actions are executed in the physics."""
+    if config.post_train.env != "imagined":
+        return []
+    rollouts = read_rollouts(path)
+    print(f"{path.name}: {rollouts.shape[:-1].numel()} imagined rollouts in the physics")
+    episodes = episodes_from_rollouts(rollouts)
+    stopped = (rollouts["next", "terminated"].squeeze(-1) & rollouts[keys.MASK]).any(-1).flatten()
+    stop = torch.where(stopped, episodes["length"].squeeze(-1), -1)
+    reached = first_success(relive(config, episodes))
+    imagined, real = judged(stop, reached)
+    rows = []
+    for task, chosen in _by_task(episodes, config):
+        figures = honesty(imagined[chosen], real[chosen], imagined_steps=stop[chosen], real_steps=reached[chosen])
+        rows.append({"iteration": int(path.stem.rsplit("_", 1)[1]), "task": task} | figures)
+    return rows
+
+
+def _frame_scores(worlds: list[TwoWorlds]) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    """R and the truth of every frame after the first, of all policies."""
+    out = {}
+    for name in ("real", "imagined"):
+        parts = []
+        for each in worlds:
+            alive = torch.arange(each.real_scores.shape[1]) <= each.episodes["length"]
+            alive[:, 0] = False
+            parts.append((getattr(each, f"{name}_scores")[alive], each.episodes["success"][alive]))
+        out[name] = torch.cat([score for score, _ in parts]), torch.cat([label for _, label in parts])
+    return out
+
+
+def short(error: Exception) -> str:
+    """The message without the folder's path."""
+    return re.split(r"checkpoints/|rollouts/", str(error))[-1]
