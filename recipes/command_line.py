@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from typing import ParamSpec
 
@@ -35,6 +36,26 @@ def one_line_errors(main: Callable[P, int | None]) -> Callable[P, int]:
                 return 1
 
     return run
+
+
+@contextmanager
+def refusals() -> Iterator[None]:
+    """Turns errors about settings, files and placements into ``SystemExit("error: ...")``."""
+    try:
+        yield
+    except (ValueError, OSError, RuntimeError) as error:
+        raise SystemExit(f"error: {in_options(error)}") from error
+
+
+def at_least(low: int, **settings: int | tuple[int, ...]) -> None:
+    """Raises ``ValueError`` for the first of the numbers (or tuples of them, which may not be empty) below ``low``."""
+    for name, value in settings.items():
+        values = value if isinstance(value, tuple) else (value,)
+        option = f"--{name.replace('_', '-')}"
+        if not values:
+            raise ValueError(f"{option} is empty: name at least one number")
+        if min(values) < low:
+            raise ValueError(f"{option} must be at least {low}, got {min(values)}")
 
 
 def in_options(error: Exception) -> str:

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 import tyro
 
-from refusal import at_least, one_line_errors
+from command_line import at_least, refusals
 from task_names import SUITES, named_tasks
 from worldenv_trl.scenes import SceneBatch, ScriptedExpert, Task, load_task
 from worldenv_trl.scenes.initial import save_poses
@@ -31,7 +31,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    with one_line_errors():
+    with refusals():
         at_least(1, count=settings.count, processes=settings.processes)
         names = named_tasks(settings.tasks)
         foreign = [name for name in names if load_task(name).states is None]

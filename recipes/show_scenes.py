@@ -16,7 +16,7 @@ import tyro
 from PIL import Image
 from torchrl.envs.utils import step_mdp
 
-from refusal import at_least, one_line_errors
+from command_line import at_least, refusals
 from task_names import SUITES
 from worldenv_trl import keys
 from worldenv_trl.envs import ExpertPolicy, TabletopEnv
@@ -45,7 +45,7 @@ class Sheet:
 
 
 def main(settings: Sheet) -> None:
-    with one_line_errors():
+    with refusals():
         check(settings)
     names = task_names(settings.suite)
     rows, broken = [], []
@@ -59,7 +59,7 @@ def main(settings: Sheet) -> None:
         raise SystemExit("error: none of the tasks can be shown")
     sheet = torch.cat(rows, -2).permute(1, 2, 0).repeat_interleave(settings.zoom, 0)
     sheet = sheet.repeat_interleave(settings.zoom, 1)
-    with one_line_errors():
+    with refusals():
         Image.fromarray(sheet.numpy()).save(settings.out)
     print(f"{settings.out}: {len(names) - len(broken)} tasks, {settings.columns} initial states each")
     if broken:

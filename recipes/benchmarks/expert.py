@@ -17,7 +17,7 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the recipes beside this folder
 
-from refusal import at_least, one_line_errors
+from command_line import at_least, refusals
 from task_names import SUITES, named_tasks
 from worldenv_trl.metrics import wilson_interval
 from worldenv_trl.scenes import SceneBatch, ScriptedExpert, list_suites, load_task
@@ -36,7 +36,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    with one_line_errors():
+    with refusals():
         at_least(1, count=settings.count, processes=settings.processes)
         tasks = named_tasks(settings.tasks or list_suites())
         for name in settings.tasks:

@@ -26,7 +26,7 @@ import tyro
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from refusal import at_least, one_line_errors
+from command_line import at_least, refusals
 from task_names import SUITES, named_tasks
 from worldenv_trl.envs import ExpertPolicy, TabletopEnv
 from worldenv_trl.keys import ACTION, ACTION_DIM, NUM_STEPS
@@ -138,7 +138,7 @@ def check(settings: Benchmark) -> None:
 
 
 def main(settings: Benchmark) -> None:
-    with one_line_errors():
+    with refusals():
         check(settings)
     sizes, rows = settings.image_sizes, settings.rows
     if settings.quick:

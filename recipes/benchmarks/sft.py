@@ -16,10 +16,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import demonstrate
 import sft
+from command_line import at_least, refusals
 from config import SFT, WorldEnvConfig
 from outcomes import physics_outcomes
 from parts import check_config, load_policy, seed_everything
-from refusal import at_least, one_line_errors
 from run_folder import RunFolder
 from worldenv_trl.metrics import wilson_interval
 from worldenv_trl.policies import laplace_actor
@@ -40,7 +40,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    with one_line_errors():
+    with refusals():
         at_least(1, episodes_per_task=settings.episodes_per_task)
         tasks = tuple(list_tasks(settings.suite))
     steps = 8 * -(-load_task(tasks[0]).max_steps // 8)  # whole chunks
@@ -52,7 +52,7 @@ def main(settings: Settings) -> None:
         max_steps=steps,
         sft=settings.sft,
     )
-    with one_line_errors():
+    with refusals():
         check_config(config)
         folder = RunFolder(config.run_dir)
         folder.open(config)

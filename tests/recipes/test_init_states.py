@@ -14,8 +14,8 @@ TASK = "goal/open_the_top_drawer_and_put_the_bowl_inside"
 
 def test_a_bowl_between_bottle_and_drawer_is_refused_and_what_is_stored_instead_is_solved():
     task = load_task(TASK)
-    first_draws = states_from_poses(task, draw_poses(task, "test", 22, 2))
-    stored = task.init_states("test")[22:24]
+    first_draws = states_from_poses(task, draw_poses(task, "test", 31, 2))
+    stored = task.init_states("test")[31:33]
     assert np.array_equal(first_draws[1], stored[1])
     assert init_states.solved_by_expert(task, np.stack([first_draws[0], *stored])).tolist() == [False, True, True]
 

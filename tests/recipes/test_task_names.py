@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from refusal import at_least, one_line_errors
+from command_line import at_least, refusals
 from task_names import named_tasks
 from worldenv_trl.scenes import list_tasks
 
@@ -37,7 +37,7 @@ def test_numbers_that_are_too_small_are_named_like_their_options():
 
 
 def test_other_errors_keep_their_traceback():
-    with pytest.raises(SystemExit, match="error: no such file"), one_line_errors():
+    with pytest.raises(SystemExit, match="error: no such file"), refusals():
         raise FileNotFoundError("no such file")
-    with pytest.raises(KeyError), one_line_errors():
+    with pytest.raises(KeyError), refusals():
         raise KeyError("a mistake of ours")
