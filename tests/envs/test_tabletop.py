@@ -192,12 +192,12 @@ def ids(env, resets):
 
 def test_cycle_gives_every_state_its_turn_wave_after_wave():
     env = make(DRAWER, 4, cameras=(), init_state_mode="cycle", init_state_count=10, init_split="test")
-    assert ids(env, 3).flatten().tolist() == [context_id(1, "test", i % 10) for i in range(12)]
+    assert ids(env, 3).flatten().tolist() == [context_id(0, "test", i % 10) for i in range(12)]
 
 
 def test_random_draws_every_state_once_before_any_twice():
     drawn = ids(make(DRAWER, 5, cameras=(), init_state_count=10), 4).reshape(2, 10)
-    assert all(sorted(epoch.tolist()) == [context_id(1, "train", i) for i in range(10)] for epoch in drawn)
+    assert all(sorted(epoch.tolist()) == [context_id(0, "train", i) for i in range(10)] for epoch in drawn)
     assert drawn[0].tolist() != drawn[1].tolist()
 
 

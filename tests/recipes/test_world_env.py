@@ -93,7 +93,7 @@ def test_the_whole_loop_runs_writes_its_files_and_continues_where_it_stopped(tin
     }
     assert all((tiny.run_dir / "plots" / f"{name}.png").exists() for name in ("losses", "evaluation"))
     contexts = read_contexts(folder)[keys.CONTEXT_ID].flatten().tolist()
-    assert contexts == [context_id(1, "train", index) for index in range(4)]  # exploration visits every one
+    assert contexts == [context_id(0, "train", index) for index in range(4)]  # exploration visits every one
     wave = read_rollouts(folder.rollouts("post_train_000"))
     assert wave[keys.CHUNK].shape[-2:] == (8, 7)
     assert "physics" in capsys.readouterr().out

@@ -201,7 +201,7 @@ def test_provenance_says_what_a_replay_needs(tmp_path):
         files = {each.name: each.data for each in make_reader(file).iter_attachments()}
     import mujoco
 
-    assert set(files) == {"0.mjb", "0.mjcf", "1.mjb", "1.mjcf"}
+    assert set(files) == {f"{place}.{kind}" for place in (0, 1) for kind in ("mjb", "mjcf", "bddl")}
     (tmp_path / "scene.mjb").write_bytes(files["0.mjb"])
     compiled = mujoco.MjModel.from_binary_path(str(tmp_path / "scene.mjb"))
     assert compiled.nq == env.tasks[0].build().nq

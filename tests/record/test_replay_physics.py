@@ -147,7 +147,7 @@ def test_another_policy_acts_from_the_branch_on_until_the_step_limit(solved, tmp
     policy = TensorDictModule(lambda state: torch.zeros(*state.shape[:-1], 4, 7), [keys.STATE], [keys.CHUNK])
     report = replay(solved, 0, from_step=5, policy=policy, target=tmp_path / "p.mcap")
     played = read_rollouts(tmp_path / "p.mcap")[0]
-    assert report.first_step == 5 and report.steps == 64  # the task's own limit
+    assert report.first_step == 5 and report.steps == 72  # the task's own limit
     assert not played[keys.ACTION].any()
     assert report.outcome["recorded"]["success"] is True and report.outcome["replayed"]["success"] is False
 
