@@ -323,7 +323,7 @@ def test_actions_are_clipped():
         (DRAWER, {"init_state_count": 0}, "init_state_count must be a whole number of at least 1, got 0"),
         (DRAWER, {"num_threads": 0}, "num_threads must be a whole number of at least 1, got 0"),
         (DRAWER, {"group_repeats": 3}, "multiple of group_repeats, got 2 and 3"),
-        (DRAWER, {"image_size": 8}, "at least 16 px, got 8"),
+        (DRAWER, {"image_size": 8}, "from 16 to 4096 px, got 8"),
         (DRAWER, {"cameras": ("front",)}, "unknown camera 'front'"),
         (DRAWER, {"init_split": "val"}, "unknown split 'val'"),
         (DRAWER, {"init_state_mode": "next"}, "got 'next'"),

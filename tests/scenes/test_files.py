@@ -113,6 +113,7 @@ def test_a_goal_without_a_script_is_refused(path):
         ("(On bowl_1 plate_1)", "(Open table_1)", 13, "table_1 has no joint for Open"),
         ("(On bowl_1 plate_1)", "(On bowl_1 table_1)", 13, "table_1 is the workspace: name one of its regions"),
         ("(On bowl_1 plate_1)", "(On bowl_1 bowl_1)", 13, "cannot be put on or into itself"),
+        ("(On bowl_1 plate_1)", "(On table_1 plate_1)", 13, "table_1 is not a thing: it cannot be put somewhere"),
         ("(On bowl_1 plate_1)", "(In bowl_1 plate_1)", 13, "plate_1 has no contain_region: did you mean On"),
         ("(On bowl_1 plate_1)", "(In bowl_1 table_1_far_region)", 13, "is flat: nothing is in it, say On"),
         ("(contain_region (:target basket_1))", "(contain_region (:target plate_1))", 13, "'plate_1_contain_region'"),

@@ -71,6 +71,11 @@ def test_a_seed_gives_the_same_state_and_another_one_another():
     [
         ("(On can_1 cabinet_1_top_side)", "", "<text>:8: 'can_1': it has no place in :init"),
         ("(On bowl_1 plate_1)", "(On bowl_1 plate_1) (On bowl_1 can_1)", "bowl_1 is placed twice"),
+        (
+            "(Open cabinet_1_top_region)",
+            "(Open cabinet_1_top_region) (Close cabinet_1_top_region)",
+            "the joint of cabinet_1_top_region is set twice in :init",
+        ),
         ("(Open cabinet_1_top_region)", "(Open plate_1)", "plate_1 has no joint for Open"),
         (
             "(On plate_1 table_1_free_region) (On bowl_1 plate_1)",

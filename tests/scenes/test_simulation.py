@@ -144,7 +144,7 @@ def test_sizes_and_states_that_cannot_be_are_refused():
     task = load_task(TASKS[0])
     with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
         SceneBatch(task, 0)
-    with pytest.raises(ValueError, match="at least 16 px, got 8"):
+    with pytest.raises(ValueError, match="from 16 to 4096 px, got 8"):
         SceneBatch(task, 1, image_size=8)
     with pytest.raises(ValueError, match="unknown camera 'side'"):
         SceneBatch(task, 1, cameras=("side",))

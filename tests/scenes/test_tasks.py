@@ -37,6 +37,7 @@ def test_the_starter_tasks_stand_beside_the_suites_in_the_order_of_their_ids():
     ("call", "message"),
     [
         (lambda: load_task("starter/turn_on_the_stve"), "did you mean 'starter/turn_on_the_stove'"),
+        (lambda: load_task("goal"), "'goal' is a suite: name tasks of it, for instance 'goal/open_the_middle_drawer'"),
         (lambda: load_task("???"), "suite/name, suites are starter, spatial, object, goal, long"),
         (lambda: list_tasks("gaol"), "unknown suite 'gaol': it must be one of spatial, object, goal, long, starter"),
         (lambda: load_task(BOWL).init_states("validation"), "'validation': it must be 'train' or 'test'"),

@@ -37,6 +37,8 @@ def load_task(name: str | Path) -> FileTask:
     """
     if str(name).endswith(".bddl"):
         return load_bddl(name)
+    if name in _MAX_STEPS:
+        raise ValueError(f"{name!r} is a suite: name tasks of it, for instance {list_tasks(str(name))[0]!r}")
     if name not in _known():
         close = difflib.get_close_matches(str(name), _known(), n=1, cutoff=0.3)
         hint = (

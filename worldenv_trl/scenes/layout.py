@@ -67,7 +67,10 @@ class Layout:
             if whole[0] in ("On", "In"):
                 self._place(*whole)
             else:
-                self._joints.append((whole[0], *joint_of(problem, entities, "init", whole)))
+                thing, part = joint_of(problem, entities, "init", whole)
+                if (thing, part) in {joint[1:] for joint in self._joints}:
+                    raise problem.error("init", *whole, message=f"the joint of {whole[1]} is set twice in :init")
+                self._joints.append((whole[0], thing, part))
         self._order()
 
     def _place(self, predicate: str, thing: str, place: str) -> None:

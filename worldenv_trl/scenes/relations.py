@@ -76,8 +76,9 @@ class Relations:
     def _check_place(self, predicate: str, thing: str, place: str) -> None:
         """Raises :class:`BDDLError` for a place where nothing can ever be."""
         here = ("goal", predicate, thing, place)
-        if thing not in self.entities:
-            raise self.problem.error(*here, message=f"{thing} is not a thing that can be put somewhere")
+        if thing not in self.problem.objects:
+            why = "is a fixture, which never moves" if thing in self.entities else "is not a thing"
+            raise self.problem.error(*here, message=f"{thing} {why}: it cannot be put somewhere")
         if place not in self.entities and place not in self.problem.regions:
             raise self.problem.error(*here, message=f"{place} is the workspace: name one of its regions")
         owner, part = self.part(place)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from worldenv_trl.scenes.tasks import Task
 
 _POSITIONS = mujoco.mjtStage.mjSTAGE_POS.value
+_LARGEST_IMAGE = 4096  # px; with supersampling, what GL draws into has twice as many each way
 _MAX_SPEED = 1e4  # m/s or rad/s; a simulation that is faster has blown up
 
 
@@ -30,7 +31,7 @@ class SceneBatch:
     Args:
         task: the task.
         num_envs: number of rows ``n``.
-        image_size: height and width (px), at least 16.
+        image_size: height and width (px), from 16 to 4096.
         cameras: cameras to render (``agentview``, ``wrist``), or none.
         num_threads: of physics, and processes that draw (see :class:`RendererPool`); two by default.
         pool: draws the images, instead of threads of the batch's own; the batch does not close it.
@@ -52,8 +53,8 @@ class SceneBatch:
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        if not isinstance(image_size, int) or image_size < 16:
-            raise ValueError(f"image_size must be a whole number of at least 16 px, got {image_size!r}")
+        if not isinstance(image_size, int) or not 16 <= image_size <= _LARGEST_IMAGE:
+            raise ValueError(f"image_size must be a whole number from 16 to {_LARGEST_IMAGE} px, got {image_size!r}")
         self.task, self.num_envs, self.image_size = task, num_envs, image_size
         self.model = task.build()
         known = {_short_name(full): full for full in (self.model.camera(i).name for i in range(self.model.ncam))}
