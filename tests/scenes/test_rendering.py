@@ -45,7 +45,8 @@ def test_every_pixel_is_the_mean_of_what_mujoco_draws(name):
         for row in range(3):
             scene.load(data, row)
             mujoco.mj_forward(model, data)
-            task.paint(model, data.qpos)
+            for glow in task.glows(model):
+                glow.apply(model, data.qpos)
             for short, full in CAMERAS.items():
                 renderer.update_scene(data, full)
                 assert np.array_equal(images[short][row], block_means(renderer.render())), (step, row, short)

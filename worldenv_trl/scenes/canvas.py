@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 # Twice the pixels each way and a mean: in software GL cheaper than MuJoCo's four samples a pixel, and unlike those not
-# done under a lock that all contexts share, so that two threads draw nearly twice as fast as one.
+# done under a lock that all contexts of a process share.
 SUPERSAMPLING = 2
 _HIDDEN = 5  # a geom group that MuJoCo does not draw
 _HALVES, _QUARTER = np.uint64(0x0002_0002_0002_0002), np.uint64(2)  # of a sum of four, for each of four channels

@@ -49,11 +49,6 @@ class Task(abc.ABC):
     def glows(self, model: mujoco.MjModel) -> Sequence[Glow]:
         """Colours that show the state: a burner glows while its stove is on."""
 
-    def paint(self, model: mujoco.MjModel, qpos: np.ndarray) -> None:
-        """Gives ``model`` the colours that show the state ``qpos``."""
-        for glow in self.glows(model):
-            glow.apply(model, qpos)
-
     @abc.abstractmethod
     def init_states(self, split: str, count: int = 50) -> np.ndarray:
         """Initial states ``[count, S]`` float64: settled, free of collisions, fixed by seed.
