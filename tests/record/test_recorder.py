@@ -21,6 +21,7 @@ from worldenv_trl.envs import TabletopEnv, chunked
 from worldenv_trl.kinematics import ActionMap, ForwardKinematics
 from worldenv_trl.record import Recorder, list_rollouts, model_hash, provenance, read_rollouts, recorded
 from worldenv_trl.record.mcap_writer import McapWriter
+from worldenv_trl.record.scan import METADATA_COPY
 from worldenv_trl.scenes import load_task
 
 TASKS = ["starter/open_the_top_drawer", "starter/turn_on_the_stove"]
@@ -201,6 +202,7 @@ def test_provenance_says_what_a_replay_needs(tmp_path):
         files = {each.name: each.data for each in make_reader(file).iter_attachments()}
     import mujoco
 
+    assert files.pop(METADATA_COPY)
     assert set(files) == {f"{place}.{kind}" for place in (0, 1) for kind in ("mjb", "mjcf", "bddl")}
     (tmp_path / "scene.mjb").write_bytes(files["0.mjb"])
     compiled = mujoco.MjModel.from_binary_path(str(tmp_path / "scene.mjb"))

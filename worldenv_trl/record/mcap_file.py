@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import json
 import os
 import shutil
 import time
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from worldenv_trl.record.mcap_writer import McapWriter
+from worldenv_trl.record.scan import METADATA_COPY
 
 __all__ = ["PARTIAL_SUFFIX", "REPAIRED_SUFFIX", "McapFile", "check_target"]
 
@@ -76,6 +78,8 @@ class McapFile:
         self._writer = McapWriter(self._file, _CHUNK_BYTES)
         self._schemas: dict[tuple[str, bytes], int] = {}
         self._channels: dict[str, int] = {}
+        self._metadata: list[tuple[str, dict[str, str]]] = []
+        self._metadata_bytes = 0
         self._call(self._writer.start, "worldenv_trl")
         self.flush()
 
@@ -105,7 +109,7 @@ class McapFile:
     def require_space(self, needed: int) -> None:
         """Raises ``OSError`` if the disk has less than ``needed`` bytes free."""
         free = shutil.disk_usage(self.path.parent).free
-        if free < needed + _RESERVE:
+        if free < needed + _RESERVE + 2 * self._metadata_bytes:
             raise OSError(
                 errno.ENOSPC,
                 f"{self.path} needs about {needed / 2**20:.0f} MiB more and the disk has {free / 2**20:.0f} MiB free: "
@@ -114,6 +118,8 @@ class McapFile:
 
     def write_metadata(self, name: str, values: Mapping[str, str]) -> None:
         self._call(self._writer.add_metadata, name, dict(values))
+        self._metadata.append((name, dict(values)))
+        self._metadata_bytes += sum(len(key) + len(value) for key, value in values.items())
 
     def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
         self._call(self._writer.add_attachment, name, media_type, data)
@@ -174,6 +180,8 @@ class McapFile:
 
     def finish(self) -> None:
         """Completes the partial file without giving it its name."""
+        self._call(self._writer.end_chunk)
+        self.attach(METADATA_COPY, json.dumps(self._metadata).encode(), "application/json")
         self._call(self._writer.finish)
         self._call(self._file.flush)
         self._call(os.fsync, self._file.fileno())

@@ -113,14 +113,11 @@ def read_attachments(path: str | os.PathLike) -> dict[str, bytes]:
 
 
 def _read(recording: Recording, keep: Callable | None, wanted: Callable[[_Path], bool]) -> list[Part]:
-    expected = [
-        sum(length for i, length in enumerate(part.lengths) if keep is None or keep(part.numbers[i], 0, 2**62))
-        for part in recording.written
-    ]
+    expected = recording.expected(keep)
     parts = recording.parts(keep, wanted)
     if not parts:
         return []
-    said = recording.warning(parts, sum(expected))
+    said = recording.warning(parts, expected)
     if said:
         warnings.warn(said, stacklevel=4)
     return parts

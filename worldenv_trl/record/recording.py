@@ -57,7 +57,11 @@ class Recording:
         self.path, self.scan = path, McapScan(path)
         records = self.scan.metadata
         version = next((record.metadata.get("version", "0") for record in records if record.name == FORMAT), None)
+        if version is None and any(record.name.startswith(f"{FORMAT}.") for record in records):
+            version = str(VERSION)  # its record was lost
         if version is None:
+            if not self.scan.intact:
+                raise ValueError(f"{path} holds no worldenv_trl rollouts any more: it {self.scan.losses[0]}")
             raise ValueError(f"{path} holds no worldenv_trl rollouts: it was written by another program")
         self.version = int(version) if version.isdigit() else 0
         if not 1 <= self.version <= VERSION:
@@ -67,6 +71,7 @@ class Recording:
         self.metadata: dict[str, Any] = {}
         self.written: list[Part] = []
         self.streams: list[tuple[Layout, str]] = []
+        self._lengths: list[int] = []  # of a recorder's rollouts, if it was closed
         self._layouts: list[Layout] = []
         self._texts: list[list] = []
         self._annotations: dict[str, Layout] = {}
@@ -90,6 +95,8 @@ class Recording:
                 self._note_write(value)
             elif kind == "stream":
                 self.streams.append((Layout.from_json(value["layout"]), value["prefix"]))
+            elif kind == "lengths":
+                self._lengths = list(value)
             elif kind == "texts":
                 self._texts.append([[tuple(path), said] for path, said in value])
             elif kind == "annotation":
@@ -97,8 +104,9 @@ class Recording:
             elif kind == "repaired":
                 self.repaired = True
         except (json.JSONDecodeError, KeyError, IndexError, TypeError, ValueError) as error:
+            why = "" if self.scan.intact else f" (it {self.scan.losses[0]})"
             raise ValueError(
-                f"{self.path} describes its rollouts in a way this release does not know: {error!r}"
+                f"{self.path} describes its rollouts in a way this release does not know{why}: {error!r}"
             ) from error
 
     def _parsed(self, values: dict[str, str]) -> dict[str, Any]:
@@ -112,6 +120,9 @@ class Recording:
     def _note_write(self, record: dict[str, Any]) -> None:
         index = record["layout"]
         layout, lengths = self._layouts[index], record["lengths"]
+        # Where an earlier write is missing, counting would go wrong; files of format 1 say neither.
+        self._time = record.get("start", self._time)
+        self._number = record.get("first", self._number)
         starts = []
         for length in lengths:
             starts.append(self._time)
@@ -157,8 +168,11 @@ class Recording:
             streamed = [part.select(self._kept(part, keep)) for part in streamed]
         parts = [part for part in (*written, *streamed) if part.rows]
         self.damaged = set()
-        if self.streams and keep is None:  # how many there were is not written anywhere
-            self.damaged = set(range(max(found, default=-1))) - {n for part in streamed for n in part.numbers}
+        if self.streams and keep is None:  # where a recorder was not closed, how many there were is not known
+            count = max(len(self._lengths), max(found, default=-1))
+            whole = {n: length for part in streamed for n, length in zip(part.numbers, part.lengths, strict=True)}
+            lengths = dict(enumerate(self._lengths))
+            self.damaged = {n for n in range(count) if n not in whole or whole[n] < lengths.get(n, 0)}
         for part in parts:
             part.decode(found, self.scan.intact and not self.repaired, wanted)
             self._annotate(part, found, wanted)
@@ -175,7 +189,8 @@ class Recording:
         starts = [start for part in self.written for start in part.starts]
         numbers = [number for part in self.written for number in part.numbers]
         for chunk in self.scan.chunks:
-            if spans is not None and not _overlaps(spans, chunk.start_time, chunk.end_time):
+            # Without an index a chunk's times are not to be trusted, nor are the channels known before it is opened.
+            if spans is not None and self.scan.indexed and not _overlaps(spans, chunk.start_time, chunk.end_time):
                 continue
             for channel, number, time, data in self.scan.messages(chunk):
                 if self.version == 1:  # its messages do not name their rollout, but rollouts do not overlap in time
@@ -268,10 +283,18 @@ class Recording:
         return found - {(TEXT,)}
 
     def count(self) -> int:
-        """How many rollouts the file holds."""
+        """How many rollouts were recorded; those that are damaged have their numbers, too."""
         if not self.streams:
             return self._number
-        return sum(part.rows for part in self.parts(wanted=lambda _: False))
+        if self._lengths:
+            return len(self._lengths)
+        return 1 + max((n for part in self.parts(wanted=lambda _: False) for n in part.numbers), default=-1)
+
+    def expected(self, keep: Callable[[int, int, int], bool] | None = None) -> int:
+        """How many entries the chosen rollouts had, as far as the file says."""
+        said = [pair for part in self.written for pair in zip(part.numbers, part.lengths, strict=True)]
+        said += enumerate(self._lengths)
+        return sum(length for number, length in said if keep is None or keep(number, 0, 2**62))
 
     def warning(self, parts: Iterable[Part], expected: int) -> str:
         """What is missing, if anything, when ``parts`` of ``expected`` entries were read."""
@@ -285,7 +308,8 @@ class Recording:
             return (
                 f"{said}, {most} of rollout{'s' * (len(self.damaged) > 1)} {_ranges(sorted(self.damaged))} are missing"
             )
-        return f"{said}, {'all that it announces' if self.written else 'and none before them is missing'}"
+        known = self.written or self._lengths
+        return f"{said}, {'all that it announces' if known else 'and none before them is missing'}"
 
 
 def _ranges(numbers: list[int]) -> str:

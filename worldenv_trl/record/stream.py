@@ -181,6 +181,8 @@ class RolloutStream:
                 if self._error is None:
                     if job is _CLOSE:
                         self._write_block()
+                        # So that a reader knows of rollouts that are lost whole.
+                        self._file.write_metadata(f"{FORMAT}.lengths", {"json": json.dumps(self._lengths)})
                         self._file.close()
                     elif job is not None:
                         job()

@@ -138,6 +138,7 @@ class RolloutWriter:
             "lengths": lengths.tolist(),
             "texts": [[list(path), texts[path]] for path in layout.texts],
             "first": first,
+            "start": self._time,
         }
         if layout.splits_frames:
             executed = flat["next", STEP_MASK].sum(-1)

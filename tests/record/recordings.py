@@ -1,0 +1,52 @@
+"""Small rollouts, an environment and a file to record them into."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NonTensorData, TensorDict
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from worldenv_trl import keys
+from worldenv_trl.record import RolloutWriter
+
+
+def make_rollouts(rows: int = 4, steps: int = 10, size: int = 32) -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randint(0, 256, (rows, steps + 1, 3, size, size), generator=generator, dtype=torch.uint8)
+    return TensorDict(
+        {
+            "observation": {"image": image[:, :-1]},
+            keys.ACTION: torch.randn(rows, steps, 7, generator=generator),
+            keys.INSTRUCTION: NonTensorData("do it", batch_size=[rows, steps]),
+            "next": {"observation": {"image": image[:, 1:]}, "reward": torch.ones(rows, steps, 1)},
+        },
+        batch_size=[rows, steps],
+    )
+
+
+class NoiseEnv(EnvBase):
+    """Rows that show noise."""
+
+    def __init__(self, rows: int) -> None:
+        super().__init__(batch_size=[rows])
+        shape = (rows, 3, 32, 32)
+        image = Bounded(0, 255, shape, dtype=torch.uint8, domain="discrete")
+        self.observation_spec = Composite({"observation": Composite(image=image, shape=[rows])}, shape=[rows])
+        self.action_spec, self.reward_spec = Unbounded([rows, 7]), Unbounded([rows, 1])
+
+    def _reset(self, tensordict=None):
+        return TensorDict({"observation": self.observation_spec["observation"].rand()}, self.batch_size)
+
+    def _step(self, tensordict):
+        flags = {name: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for name in ("done", "terminated")}
+        return self._reset().update({"reward": torch.zeros(*self.batch_size, 1), **flags})
+
+    def _set_seed(self, seed):
+        return seed
+
+
+def record(path, *rollouts: TensorDict) -> None:
+    with RolloutWriter(path, metadata={"seed": 1}) as writer:
+        for part in rollouts:
+            writer.write(part)
