@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -26,7 +27,7 @@ class Options:
     """A folder for a recording, a recording for the others."""
     video: bool = False
     """LeRobot: MP4 files instead of images; without loss, too."""
-    alignment: str = "stored"
+    alignment: Literal["stored", "executed"] = "stored"
     """HDF5: which observation goes with an action, stored or executed (see data/README.md)."""
     overwrite: bool = False
     """Replace the target."""
@@ -45,6 +46,10 @@ def main(options: Options) -> int:
         raise ValueError(f"a recording becomes a LeRobot folder: give a folder's name instead of {target}")
     if source.suffix != ".mcap" and target.suffix != ".mcap":
         raise ValueError(f"{source} becomes a recording: give a name that ends in .mcap instead of {target}")
+    if options.video and source.suffix != ".mcap":
+        raise ValueError(f"--video is for what becomes a LeRobot folder, and {source} becomes a recording")
+    if options.alignment != "stored" and source.suffix not in (".hdf5", ".h5"):
+        raise ValueError(f"--alignment is for HDF5 files, {source} is none")
     if source.suffix == ".mcap":
         rollouts = read_rollouts(source)
         write_lerobot(rollouts, target, video=options.video, overwrite=options.overwrite)

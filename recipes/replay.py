@@ -62,6 +62,8 @@ class Options:
 def main(options: Options) -> int:
     if options.json is not None and str(options.json) != "-" and options.json.exists() and not options.overwrite:
         raise FileExistsError(f"{options.json} exists: pass --overwrite or another name")
+    if options.threshold is not None and not 0 < options.threshold < 1:
+        raise ValueError(f"--threshold must be in (0, 1), got {options.threshold}")
     metadata = read_metadata(options.file)
     imagined = options.mode == "imagination" or (
         options.mode is None and open_rollout(options.file, options.rollout).imagined

@@ -19,8 +19,9 @@ from typing import Literal
 import tyro
 
 from command_line import one_line_errors
+from worldenv_trl.record import list_rollouts
 from worldenv_trl.record.viewers_foxglove import foxglove_layout
-from worldenv_trl.record.viewers_rerun import rerun_recording
+from worldenv_trl.record.viewers_rerun import require_rerun, rerun_recording
 
 MOST = 16  # rollouts that are shown if none is named
 
@@ -30,7 +31,7 @@ class Options:
     file: tyro.conf.Positional[Path]
     """A recording."""
     rollout: tuple[int, ...] = ()
-    """Numbers of rollouts; the first 16 if none is given."""
+    """Numbers of rollouts; Rerun shows the first 16 if none is given, Foxglove all (where they begin is printed)."""
     viewer: Literal["rerun", "foxglove"] = "rerun"
     save: Path | None = None
     """Write this file (.rrd for Rerun, .json for Foxglove's layout) instead of opening a window."""
@@ -44,12 +45,16 @@ def main(options: Options) -> int:
         raise ValueError(f"{options.file} is a folder: name one recording to show")
     if not options.file.exists():
         raise FileNotFoundError(f"there is no file {options.file}")
+    suffix = ".json" if options.viewer == "foxglove" else ".rrd"
+    if options.save is not None and options.save.suffix != suffix:
+        raise ValueError(f"--save must end in {suffix} for {options.viewer}, got {options.save}")
     if options.save is not None and options.save.exists() and not options.overwrite:
         raise FileExistsError(f"{options.save} exists: pass --overwrite or another name")
     return _foxglove(options) if options.viewer == "foxglove" else _rerun(options)
 
 
 def _rerun(options: Options) -> int:
+    require_rerun()
     if options.save is None and not has_display():
         raise OSError("there is no display to open a window on: pass --save rollouts.rrd and open that elsewhere")
     recording = rerun_recording(options.file, options.rollout or slice(MOST))
@@ -67,6 +72,10 @@ def _rerun(options: Options) -> int:
 
 def _foxglove(options: Options) -> int:
     layout = json.dumps(foxglove_layout(options.file), indent=1)
+    infos = {info.number: info for info in list_rollouts(options.file)} if options.rollout else {}
+    for number in options.rollout:
+        if number not in infos:
+            raise ValueError(f"{options.file} holds the rollouts 0 to {max(infos)}, not {number}")
     target = options.save or options.file.with_name(f"{options.file.stem}.foxglove.json")
     if target.exists() and not options.overwrite and target.read_text() != layout:
         raise FileExistsError(f"{target} exists: pass --overwrite or --save another name")
@@ -77,6 +86,8 @@ def _foxglove(options: Options) -> int:
     else:
         print(f"open {options.file} in Foxglove (desktop or app.foxglove.dev)")
     print(f"layout: {target} (Foxglove: Layouts, Import from file)")
+    for number in options.rollout:
+        print(f"rollout {number} begins at {infos[number].start:.2f} s of the time line: {infos[number].instruction}")
     return 0
 
 

@@ -49,6 +49,8 @@ def made(tmp_path_factory):
     (folder / "empty.mcap").write_bytes(b"")
     (folder / "taken").mkdir()
     (folder / "taken.mcap").write_bytes(b"precious")
+    (folder / "taken.rrd").write_bytes(b"precious")
+    RolloutWriter(folder / "bare.mcap").close()
     OFTPolicy(OFTConfig.for_tasks({0: "do it"}, dim=32, depth=1)).save_pretrained(folder / "policy")
     return folder
 
@@ -96,6 +98,8 @@ REPLAY = [
     (("real.mcap", "--mode", "dreaming"), "mode must be one of physics, imagination, got 'dreaming'"),
     (("real.mcap", "--mode", "imagination"), "--world-model"),
     (("real.mcap", "--threshold", "0.5"), "--reflector"),
+    (("real.mcap", "--threshold", "3"), "--threshold must be in (0, 1), got 3"),
+    (("bare.mcap",), "bare.mcap holds no rollouts"),
     (("real.mcap", "--policy", "gone"), "gone"),
     (("real.mcap", "--world-model", "policy", "--mode", "imagination"), "holds a OFTPolicy, not a VideoWorldModel"),
     (("real.mcap", "--seed", "1"), "pass --policy"),
@@ -108,7 +112,10 @@ VIEW = [
     *READERS,
     (("empty",), "empty is a folder: name one recording"),
     (("real.mcap", "--rollout", "2"), "holds the rollouts 0 to 1, not 2"),
-    (("real.mcap", "--save", "taken.mcap"), "taken.mcap exists: pass --overwrite"),
+    (("real.mcap", "--save", "taken.rrd"), "taken.rrd exists: pass --overwrite"),
+    (("real.mcap", "--save", "new.mcap"), "--save must end in .rrd for rerun, got new.mcap"),
+    (("real.mcap", "--viewer", "foxglove", "--save", "new.rrd"), "--save must end in .json for foxglove, got new.rrd"),
+    (("real.mcap", "--viewer", "foxglove", "--save", "a.json", "--rollout", "2"), "holds the rollouts 0 to 1, not 2"),
 ]
 REPAIR = [
     *EVERYONE,
@@ -126,6 +133,8 @@ CONVERT = [
     (("text.hdf5", "new"), "give a name that ends in .mcap instead of"),
     (("real.mcap", "new.mcap"), "a recording becomes a LeRobot folder"),
     (("real.mcap", "taken"), "taken exists: pass --overwrite"),
+    (("real.mcap", "new", "--alignment", "executed"), "--alignment is for HDF5 files, real.mcap is none"),
+    (("text.hdf5", "new.mcap", "--video"), "--video is for what becomes a LeRobot folder"),
 ]
 CASES = [
     pytest.param(recipe, arguments, said, id=f"{recipe.__name__} {' '.join(arguments)}")

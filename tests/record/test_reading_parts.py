@@ -119,3 +119,23 @@ def test_an_unknown_entry_is_named_with_those_that_are_close(tmp_path):
         read_rollouts(tmp_path / "a.mcap", keys=["acton"])
     with pytest.raises(ValueError, match=r"did you mean \('observation', 'image'\)"):
         read_rollouts(tmp_path / "a.mcap", keys=[("observation", "images")])
+
+
+@pytest.mark.parametrize(
+    ("asked", "error", "message"),
+    [
+        ({"keys": "action"}, TypeError, "keys must be a list of entries, such as .*, got 'action'"),
+        ({"keys": [("next", 3)]}, TypeError, "keys must be a list of entries"),
+        ({"rollouts": "0"}, TypeError, "rollouts must be a number, a slice or a list of numbers, got '0'"),
+        ({"rollouts": [True]}, TypeError, r"a list of numbers, got \[True\]"),
+        ({"time": 5}, TypeError, "time must be two numbers, the first and the last second, got 5"),
+        ({"time": (5, 1)}, ValueError, r"in this order, got \(5, 1\)"),
+        ({"steps": 3}, TypeError, r"steps must be a slice, such as slice\(0, 10\), got 3"),
+        ({"task": 3}, TypeError, "task must be a name such as .*, got 3"),
+        ({"path": ""}, ValueError, "path is empty: name a file, a folder or a pattern"),
+        ({"path": None}, TypeError, "path must be a file, a folder or a pattern, got None"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_before_a_file_is_opened(asked, error, message):
+    with pytest.raises(error, match=message):
+        read_rollouts(**({"path": "gone.mcap"} | asked))

@@ -106,6 +106,35 @@ def test_predicted_states_action_maps_and_annotations_are_added(tmp_path):
     assert torch.equal(read[keys.ADVANTAGE].flatten(), torch.arange(24.0))
 
 
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"exclude": "sim_state"}, TypeError, "exclude must be a list of entries.*got 'sim_state'"),
+        ({"exclude": [3]}, TypeError, r"exclude must be a list of entries.*got \[3\]"),
+        ({"action_map": 1}, TypeError, "action_map must be a worldenv_trl.kinematics.ActionMap, got 1"),
+        ({"kinematics": "fk"}, TypeError, "kinematics must be a worldenv_trl.kinematics.ForwardKinematics, got 'fk'"),
+        ({"queue_size": 0}, ValueError, "queue_size must be a whole number of at least 1, got 0"),
+        ({"queue_size": 2.5}, ValueError, "queue_size must be a whole number of at least 1, got 2.5"),
+    ],
+)
+def test_options_of_another_kind_are_refused_at_once(tmp_path, options, error, message):
+    with pytest.raises(error, match=message):
+        Recorder(tmp_path / "a.mcap", **options)
+
+
+def test_what_is_excluded_must_be_there_and_may_be_a_nest(tmp_path):
+    env = recorded(make_env(), tmp_path / "a.mcap", exclude=["sucess"])
+    with pytest.raises(ValueError, match=r"exclude names sucess, which the env does not show: did you mean success\?"):
+        env.rollout(1)
+    env.close()
+    assert not list(tmp_path.iterdir())
+    env = recorded(make_env(), tmp_path / "a.mcap", exclude=["observation", ("next", "reward")])
+    env.rollout(2)
+    env.close()
+    have = read_rollouts(tmp_path / "a.mcap").keys(True, True)
+    assert keys.ACTION in have and not {keys.IMAGE, keys.STATE, ("next", *keys.IMAGE), ("next", "reward")} & set(have)
+
+
 def test_steps_reach_the_disk_within_a_second_while_the_env_pauses(tmp_path):
     env = recorded(make_env(), tmp_path / "a.mcap")
     env.rollout(3, break_when_any_done=False)

@@ -17,6 +17,7 @@ from torch import Tensor
 from worldenv_trl.keys import EPISODE, MASK, ROW, SIM_STATE, TASK_ID
 from worldenv_trl.record.mcap_file import PARTIAL_SUFFIX, REPAIRED_SUFFIX
 from worldenv_trl.record.part import Part
+from worldenv_trl.record.reader_arguments import check_arguments
 from worldenv_trl.record.recording import TEXT, Recording, RolloutInfo
 
 __all__ = ["list_rollouts", "read_attachments", "read_metadata", "read_rollouts"]
@@ -62,9 +63,12 @@ def read_rollouts(
 
     Raises:
         FileNotFoundError: if there is no such file, or none in the folder.
+        TypeError: if an argument is of another kind.
         ValueError: for a file that is no MCAP, without messages that it should hold, or not written by this package
             or by a later release of it; for files whose entries differ; if ``task``, a rollout or a key is not in them.
     """
+    rollouts = rollouts.tolist() if hasattr(rollouts, "tolist") else rollouts  # arrays and tensors
+    check_arguments(path, task, rollouts, time, steps, keys)
     recordings = _recordings(path, replays)
     if task is not None:
         for recording in recordings:
@@ -93,6 +97,7 @@ def list_rollouts(path: str | os.PathLike, *, replays: bool = False) -> list[Rol
 
     Raises and warns as :func:`read_rollouts`.
     """
+    check_arguments(path)
     infos: list[RolloutInfo] = []
     for recording in _recordings(path, replays):
         infos += recording.infos(_read(recording, None, lambda key: key in ((ROW,), (EPISODE,))))
@@ -101,11 +106,13 @@ def list_rollouts(path: str | os.PathLike, *, replays: bool = False) -> list[Rol
 
 def read_metadata(path: str | os.PathLike) -> dict[str, Any]:
     """The ``metadata`` that a file was recorded with. Raises as :func:`read_rollouts`."""
+    check_arguments(path)
     return Recording(_require_file(path)).metadata
 
 
 def read_attachments(path: str | os.PathLike) -> dict[str, bytes]:
     """The attachments of a file, by name. Raises as :func:`read_rollouts`."""
+    check_arguments(path)
     return {each.name: each.data for each in Recording(_require_file(path)).scan.attachments}
 
 
@@ -139,6 +146,8 @@ def _chosen(recordings: list[Recording], rollouts: int | slice | Sequence[int] |
     if rollouts is None:
         return None
     counts = [recording.count() for recording in recordings]
+    if not sum(counts):
+        return [set() for _ in recordings]
     if isinstance(rollouts, slice):
         numbers = list(range(*rollouts.indices(sum(counts))))
     else:
@@ -235,7 +244,8 @@ def _join(parts: list[Part], path: str | os.PathLike) -> TensorDict:
         if have != names[0]:
             raise ValueError(
                 f"{part.file} and {parts[0].file} hold different entries "
-                f"({sorted(map(str, have ^ names[0]))}): read them one by one"
+                f"({', '.join(sorted('/'.join(key[1:]) for key in have ^ names[0]))}): read them one by one, or "
+                "name the entries that both hold with keys=[...]"
             )
     for key in list(expanded[0]):
         if key == ("root", TEXT):

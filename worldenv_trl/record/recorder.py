@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import multiprocessing
 import os
 import re
@@ -52,14 +53,15 @@ class Recorder(Transform):
 
     Keyword Args:
         metadata, attachments, overwrite: see :class:`~worldenv_trl.record.RolloutWriter`.
-        exclude: entries that are not recorded.
+        exclude: entries that are not recorded, before and after the step; the name of a nest leaves out all in it.
         kinematics: adds ``predicted_state`` to step-level rollouts with ``kinematic_state`` and ``action``.
         action_map: adds ``action_map``; drawing it costs much more than everything else that is recorded.
         worker: replaces the worker's name, also outside of worker processes.
         queue_size: env steps that may wait to be written.
 
     Raises:
-        ValueError, FileExistsError: as :class:`~worldenv_trl.record.RolloutWriter`, at once.
+        ValueError, FileExistsError: as :class:`~worldenv_trl.record.RolloutWriter`, at once; at the first step, if
+            ``exclude`` names nothing.
         OSError: as there, from the first step on.
 
     Examples:
@@ -82,12 +84,23 @@ class Recorder(Transform):
         queue_size: int = 64,
     ) -> None:
         super().__init__()
-        if queue_size < 1:
-            raise ValueError(f"queue_size must be at least 1, got {queue_size}")
+        if not isinstance(queue_size, int) or queue_size < 1:
+            raise ValueError(f"queue_size must be a whole number of at least 1, got {queue_size!r}")
+        if isinstance(exclude, str) or not all(isinstance(key, str | tuple) for key in exclude):
+            raise TypeError(
+                f'exclude must be a list of entries, such as ["sim_state", ("next", "reward")], got {exclude!r}'
+            )
+        for name, part, kind in (
+            ("kinematics", kinematics, "ForwardKinematics"),
+            ("action_map", action_map, "ActionMap"),
+        ):
+            if part is not None and not callable(part):
+                raise TypeError(f"{name} must be a worldenv_trl.kinematics.{kind}, got {part!r}")
         self._target = Path(path)
         self._options = {"metadata": metadata, "attachments": attachments, "overwrite": overwrite}
         self._derived = {"kinematics": kinematics, "action_map": action_map}
-        self._exclude = {(key,) if isinstance(key, str) else tuple(key) for key in exclude}
+        paths = [(key,) if isinstance(key, str) else key for key in exclude]
+        self._exclude = [path[1:] if path[0] == "next" and len(path) > 1 else path for path in paths]
         self._worker, self._queue_size = worker, queue_size
         self._forget()
         check_target(self.path, overwrite)  # now, not after the first rollout
@@ -181,7 +194,17 @@ class Recorder(Transform):
             self._fresh, self._over = torch.ones(count, dtype=torch.bool), torch.zeros(count, dtype=torch.bool)
         roots, root_texts = leaves(_entries(tensordict))
         nexts, next_texts = leaves(_entries(next_tensordict))
-        keep = lambda paths: [path for path in paths if path not in self._exclude]  # noqa: E731
+        known = {*roots, *root_texts, *nexts, *next_texts}
+        for left_out in self._exclude:
+            if not any(path[: len(left_out)] == left_out for path in known):
+                close = difflib.get_close_matches("/".join(left_out), ["/".join(path) for path in known], n=3)
+                hint = (
+                    f"did you mean {' or '.join(close)}"
+                    if close
+                    else f"it has {', '.join(sorted(map('/'.join, known)))}"
+                )
+                raise ValueError(f"exclude names {'/'.join(left_out)}, which the env does not show: {hint}?")
+        keep = lambda paths: [p for p in paths if not any(p[: len(out)] == out for out in self._exclude)]  # noqa: E731
         texts = keep(root_texts) + [("next", *path) for path in keep(next_texts)]
         # Stored once: what was seen after a step is what is seen before the next one.
         chained = [

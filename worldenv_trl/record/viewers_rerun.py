@@ -17,7 +17,7 @@ from torch import Tensor
 
 from worldenv_trl.record.viewers import Curve, Shown, shown_rollouts
 
-__all__ = ["APPLICATION", "rerun_blueprint", "rerun_recording"]
+__all__ = ["APPLICATION", "require_rerun", "rerun_blueprint", "rerun_recording"]
 
 APPLICATION = "worldenv_trl"
 # Plots from top to bottom: title, and the entries that belong to it.
@@ -45,7 +45,7 @@ def rerun_recording(path: str | os.PathLike, rollouts: Sequence[int] | slice = s
         ImportError: if Rerun is not installed.
         FileNotFoundError, ValueError: as :func:`~worldenv_trl.record.read_rollouts`.
     """
-    rr = _rerun()
+    rr = require_rerun()
     shown = list(shown_rollouts(path, rollouts))
     if not shown:
         raise ValueError(f"{path} holds no rollouts to show")
@@ -64,7 +64,7 @@ def rerun_recording(path: str | os.PathLike, rollouts: Sequence[int] | slice = s
 
 def rerun_blueprint(shown: Sequence[Shown]) -> Any:
     """The blueprint for these rollouts: images and the hand on the left, plots and text on the right."""
-    _rerun()
+    require_rerun()
     import rerun.blueprint as rrb
 
     images = {name for rollout in shown for name in rollout.images}
@@ -147,7 +147,7 @@ def _quaternion(vector: np.ndarray) -> list[float]:
     return [*(axis * np.sin(angle / 2)).tolist(), float(np.cos(angle / 2))]
 
 
-def _rerun() -> Any:
+def require_rerun() -> Any:
     try:
         import rerun
     except ImportError as error:
