@@ -83,8 +83,8 @@ def rerun_blueprint(shown: Sequence[Shown]) -> Any:
     right = [*plots, rrb.TextLogView(origin="/text", name="text")]
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(*left, row_shares=[2, 1][: len(left)]),
-            rrb.Vertical(*right, row_shares=[*[2] * len(plots), 1]),
+            rrb.Vertical(*left, row_shares=[(len(cameras) + 1) // 2, 1] if cameras else [1]),
+            rrb.Vertical(*right, row_shares=[*[1.0] * len(plots), max(1.0, 0.2 * len(plots))]),
             column_shares=[2, 3],
         ),
         rrb.TimePanel(state="collapsed"),
@@ -136,7 +136,8 @@ def _send(rr: Any, stream: Any, rollout: Shown, named: set[str], gap: bool) -> N
 
 
 def _colors(curve: Curve) -> np.ndarray:
-    shift = {"success": 1, "success_prob": 2, "recorded/psnr": 4}.get(curve.name, 0)  # they share a plot
+    plot = next((names for _, names in PLOTS if curve.name in names), (curve.name,))
+    shift = plot.index(curve.name) if len(curve.labels) == 1 else 0  # single lines share a plot
     return _COLORS[(np.arange(len(curve.labels)) + shift) % len(_COLORS)]
 
 
@@ -148,6 +149,7 @@ def _quaternion(vector: np.ndarray) -> list[float]:
 
 
 def require_rerun() -> Any:
+    """The module, if it is installed. Raises ImportError that says how to install it."""
     try:
         import rerun
     except ImportError as error:
