@@ -98,6 +98,9 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
         if iteration in (0, settings.iterations - 1):  # of the weights that collected it
             about = recording(config, env, target, {"policy": policy} | judges, iteration=iteration)
         metrics = _update(decisions, total_steps, loss, optimizer, [lora, heads], settings)
+        if about:
+            decisions = wave.reshape(-1).split(settings.minibatch_size)
+            wave.update(torch.cat([loss.ratios(part) for part in decisions]).reshape(wave.shape))
         mean.update_parameters(policy)
         collector.update_policy_weights_()
 

@@ -267,6 +267,31 @@ def test_diagnostics_cover_exactly_the_executed_steps():
     assert not any(out[key].requires_grad for key in ("kl_approx", "clip_fraction", "ESS"))
 
 
+@pytest.mark.parametrize("level", ["step", "chunk"])
+def test_ratios_of_a_log_are_those_whose_gradient_the_clip_takes_away(level):
+    batch, actor = make_batch(), make_actor()
+    loss = LOOPLoss(actor, clip_epsilon=(0.1, 0.2), ratio_level=level)
+    out = loss.ratios(batch)
+    assert set(batch.keys(True, True)) == set(make_batch().keys(True, True))
+    with torch.no_grad():
+        log_ratio = actor.get_dist(batch).log_prob(batch[keys.CHUNK]) - batch[keys.LOG_PROBS]
+    steps = batch["next", keys.STEP_MASK]
+    expected = torch.where(steps, log_ratio, 0.0)
+    if level == "chunk":
+        expected = torch.where(steps, expected.sum(-1, keepdim=True), 0.0)
+    assert_close(out[keys.RATIO], expected.exp())
+    assert out[keys.CLIPPED].any() and (steps & ~out[keys.CLIPPED]).any() and not out[keys.CLIPPED][~steps].any()
+    # Behaviour probabilities get a gradient exactly where nothing is clipped.
+    before = batch[keys.LOG_PROBS].clone().requires_grad_()
+    ratio = torch.where(steps, actor.get_dist(batch).log_prob(batch[keys.CHUNK]).detach() - before, 0.0)
+    ratio = (ratio.sum(-1, keepdim=True).expand_as(steps) if level == "chunk" else ratio).exp()
+    advantage = batch[keys.ADVANTAGE]
+    gain = torch.minimum(ratio * advantage, ratio.clamp(0.9, 1.2) * advantage)
+    for step in steps.nonzero()[:20].tolist():
+        (slope,) = torch.autograd.grad(gain[tuple(step)], before, retain_graph=True)
+        assert (slope.abs().max() == 0) == bool(out[keys.CLIPPED][tuple(step)])
+
+
 def test_the_input_is_left_as_it_was():
     actor, batch = make_actor(), make_batch()
     before = batch.clone()

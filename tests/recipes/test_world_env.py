@@ -95,6 +95,8 @@ def test_the_whole_loop_runs_writes_its_files_and_continues_where_it_stopped(tin
     contexts = read_contexts(folder)[keys.CONTEXT_ID].flatten().tolist()
     assert contexts == [context_id(0, "train", index) for index in range(4)]  # exploration visits every one
     wave = read_rollouts(folder.rollouts("post_train_000"))
+    steps = wave["next", keys.STEP_MASK]
+    assert wave[keys.RATIO][steps].gt(0).all() and wave[keys.CLIPPED].dtype == torch.bool
     assert wave[keys.CHUNK].shape[-2:] == (8, 7)
     assert "physics" in capsys.readouterr().out
 

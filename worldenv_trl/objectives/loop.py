@@ -134,12 +134,41 @@ class LOOPLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        names = self.tensor_keys
         tensordict = tensordict.copy()
+        steps = self._executed(tensordict)
+        log_ratio, mask, advantage = self._compared(tensordict, steps)
+        # min(r A, clip(r) A) is 0 for A = 0; taken out because a ratio that overflows would make it inf * 0.
+        ratio = torch.where(mask & (advantage != 0), log_ratio, 0.0).exp()
+        low, high = self.clip_epsilon
+        gain = torch.minimum(ratio * advantage, ratio.clamp(1 - low, 1 + high) * advantage)  # World-Env Eq. 5
+        gain = torch.where(mask, gain, 0.0)
+        if self.ratio_level == "dim":
+            gain = gain.mean(-1)
+        loss = -(gain * self._weight(tensordict, steps, gain.dtype)).sum()
+        return TensorDict({"loss_objective": loss} | self._diagnostics(log_ratio.detach(), mask))
+
+    @torch.no_grad()
+    def ratios(self, tensordict: TensorDictBase) -> TensorDict:
+        """Where the actor stands now against the one that acted: reads what :meth:`forward` reads, for a log.
+
+        Returns:
+            ``ratio`` [*B, C], new over behaviour probability, and ``clipped`` bool [*B, C], whether the clip takes the
+            gradient of that step away (a ratio that has left the interval in the direction of its advantage); 1 and
+            False where nothing was executed. Both [*B, C, 7] for ``ratio_level="dim"``.
+        """
+        tensordict = tensordict.copy()  # the actor writes into it
+        log_ratio, mask, advantage = self._compared(tensordict, self._executed(tensordict))
+        ratio = torch.where(mask, log_ratio, 0.0).exp()
+        low, high = self.clip_epsilon
+        clipped = ((ratio > 1 + high) & (advantage > 0)) | ((ratio < 1 - low) & (advantage < 0))
+        return TensorDict({keys.RATIO: ratio, keys.CLIPPED: clipped & mask}, tensordict.batch_size)
+
+    def _compared(self, tensordict: TensorDictBase, steps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Log-ratios of the executed steps [*B, C], where they hold, and the advantage; see :meth:`_log_ratio`."""
+        names = self.tensor_keys
         chunk, before = tensordict.get(names.action), tensordict.get(names.sample_log_prob)
         if before.requires_grad:
             raise ValueError(f"{names.sample_log_prob} requires grad: collect rollouts under torch.no_grad()")
-        steps = self._executed(tensordict)  # [*B, C]
         if steps.shape != chunk.shape[:-1]:
             raise ValueError(f"{names.step_mask} must be {list(chunk.shape[:-1])}, got {list(steps.shape)}")
         advantage = tensordict.get(names.advantage, None)
@@ -159,16 +188,7 @@ class LOOPLoss(LossModule):
                 f"{names.sample_log_prob} is {list(before.shape)}, the actor scores {list(now.shape)}: "
                 "collect and train with the same event_dims"
             )
-        log_ratio, mask, advantage = self._log_ratio(now - before, steps, advantage)
-        # min(r A, clip(r) A) is 0 for A = 0; taken out because a ratio that overflows would make it inf * 0.
-        ratio = torch.where(mask & (advantage != 0), log_ratio, 0.0).exp()
-        low, high = self.clip_epsilon
-        gain = torch.minimum(ratio * advantage, ratio.clamp(1 - low, 1 + high) * advantage)  # World-Env Eq. 5
-        gain = torch.where(mask, gain, 0.0)
-        if self.ratio_level == "dim":
-            gain = gain.mean(-1)
-        loss = -(gain * self._weight(tensordict, steps, gain.dtype)).sum()
-        return TensorDict({"loss_objective": loss} | self._diagnostics(log_ratio.detach(), mask))
+        return self._log_ratio(now - before, steps, advantage)
 
     def _distribution(self, tensordict: TensorDictBase) -> Distribution:
         if self.functional:
