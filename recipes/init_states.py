@@ -1,7 +1,7 @@
-"""Draws the standard initial states of the suites' tasks and stores them beside their files, over those that are there.
+"""Draws the standard initial states of tasks and stores them beside their files (``.npz``), over those that are there.
 
-``python recipes/init_states.py``, after a task file has changed; 50 of each split, fixed by the file's text. Every
-state is tried: one that the scripted expert does not solve is drawn again.
+``python recipes/init_states.py``, after a file of the suites has changed, or ``--tasks mine.bddl`` for one's own; 50 of
+each split, fixed by the file's text. Every state is tried: one that the scripted expert does not solve is drawn again.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Settings:
     """What is drawn."""
 
     tasks: tuple[str, ...] = SUITES
-    """Suites, and tasks of them."""
+    """Suites, tasks of them, and files."""
     count: int = 50
     """States of each split."""
     processes: int = 2
@@ -34,9 +34,8 @@ def main(settings: Settings) -> None:
     with refusals():
         at_least(1, count=settings.count, processes=settings.processes)
         names = named_tasks(settings.tasks)
-        foreign = [name for name in names if load_task(name).states is None]
-        if foreign:
-            raise ValueError(f"{foreign[0]} is no task of the suites: states of other files are drawn when asked for")
+        for name in names:
+            ScriptedExpert(load_task(name))  # what it has no skill for is said before anything is drawn
         with multiprocessing.get_context("spawn").Pool(settings.processes) as pool:
             for lines in pool.imap(partial(store, count=settings.count), names):
                 print("\n".join(lines), flush=True)

@@ -305,47 +305,6 @@ def test_actions_are_clipped():
 # ----------------------------------------------------------------------------------------------------- errors
 
 
-@pytest.mark.parametrize(
-    ("task", "options", "message"),
-    [
-        ("starter/open_the_top_drawr", {}, "did you mean 'starter/open_the_top_drawer'"),
-        ([], {}, "task is empty"),
-        ([DRAWER, DRAWER], {}, "named twice"),
-        (TASKS, {}, "3 tasks need at least 3 rows, got num_envs=2"),
-        (DRAWER, {"n": 0}, "num_envs must be a whole number of at least 1, got 0"),
-        (DRAWER, {"n": 2.0}, "num_envs must be a whole number of at least 1, got 2.0"),
-        (DRAWER, {"group_repeats": 0}, "group_repeats must be a whole number of at least 1, got 0"),
-        (DRAWER, {"seed": -1}, "seed must be a whole number of at least 0, got -1"),
-        (DRAWER, {"seed": 1.5}, "seed must be a whole number of at least 0, got 1.5"),
-        (DRAWER, {"seed": "1"}, "seed must be a whole number of at least 0, got '1'"),
-        (DRAWER, {"init_state_id": -1}, "init_state_id must be a whole number of at least 0, got -1"),
-        (DRAWER, {"init_state_id": 0.5}, "init_state_id must be a whole number of at least 0, got 0.5"),
-        (DRAWER, {"init_state_count": 0}, "init_state_count must be a whole number of at least 1, got 0"),
-        (DRAWER, {"num_threads": 0}, "num_threads must be a whole number of at least 1, got 0"),
-        (DRAWER, {"group_repeats": 3}, "multiple of group_repeats, got 2 and 3"),
-        (DRAWER, {"image_size": 8}, "from 16 to 4096 px, got 8"),
-        (DRAWER, {"cameras": ("front",)}, "unknown camera 'front'"),
-        (DRAWER, {"init_split": "val"}, "unknown split 'val'"),
-        (DRAWER, {"init_state_mode": "next"}, "got 'next'"),
-        (DRAWER, {"init_state_id": 50, "init_state_mode": "cycle"}, r"\[0, 50\), got 50"),
-        (DRAWER, {"max_steps": 0}, "max_steps must be a whole number of at least 1, got 0"),
-        (DRAWER, {"proprio": "true"}, "got 'true'"),
-        (DRAWER, {"context_ids": [1]}, "pass both or neither"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(task, options, message):
-    with pytest.raises(ValueError, match=message):
-        make(task, **options)
-
-
-@pytest.mark.parametrize("seed", [-1, 1.5, True])
-def test_a_seed_that_cannot_be_is_refused_and_the_old_one_stays(seed):
-    env, other = make(DRAWER, 4, cameras=()), make(DRAWER, 4, cameras=())
-    with pytest.raises(ValueError, match=f"seed must be a whole number of at least 0, got {seed}"):
-        env.set_seed(seed)
-    assert torch.equal(ids(env, 2), ids(other, 2))
-
-
 def test_a_file_s_path_is_a_task():
     path = SUITES_FOLDER / "goal" / "open_the_top_drawer.bddl"
     env = make(path, cameras=())
@@ -383,6 +342,16 @@ def test_states_that_cannot_be_are_refused():
         env.reset(TensorDict({CONTEXT_ID: torch.tensor([[200_003]])}, [1]), set_state=True)
     with pytest.raises(ValueError, match="past max_steps=5"):
         env.reset(td.clone().set(NUM_STEPS, td[NUM_STEPS] + 5), set_state=True)
+
+
+def test_a_closed_env_says_so_whether_it_drew_or_not():
+    for options in ({}, {"cameras": ()}):
+        env = make(n=2, **options)
+        td = env.reset()
+        env.close()
+        for call in (env.reset, lambda env=env: env.rollout(2), lambda env=env, td=td: env.rand_step(td)):
+            with pytest.raises(RuntimeError, match=r"this TabletopEnv was closed.*: build another one"):
+                call()
 
 
 def test_a_chunk_key_is_what_multi_action_reads():

@@ -7,7 +7,8 @@ import pytest
 
 import init_states
 from worldenv_trl.scenes import load_task
-from worldenv_trl.scenes.initial import draw_poses, states_from_poses
+from worldenv_trl.scenes.catalogue import SUITES_FOLDER
+from worldenv_trl.scenes.initial import draw_poses, load_poses, states_from_poses
 
 TASK = "goal/open_the_top_drawer_and_put_the_bowl_inside"
 
@@ -20,11 +21,21 @@ def test_a_bowl_between_bottle_and_drawer_is_refused_and_what_is_stored_instead_
     assert init_states.solved_by_expert(task, np.stack([first_draws[0], *stored])).tolist() == [False, True, True]
 
 
+def test_states_of_one_s_own_file_are_stored_beside_it(tmp_path, capsys):
+    path = tmp_path / "mine.bddl"
+    path.write_text((SUITES_FOLDER / "starter" / "turn_on_the_stove.bddl").read_text())
+    init_states.main(init_states.Settings(tasks=(str(path),), count=2, processes=1))
+    assert "mine.bddl: 2 + 2 states" in capsys.readouterr().out
+    task = load_task(path)
+    assert {split: len(poses) for split, poses in load_poses(task, task.states).items()} == {"train": 2, "test": 2}
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"tasks": ("goal/no_such",)}, "unknown task 'goal/no_such'"),
         ({"tasks": ("gaol",)}, "did you mean 'goal'"),
+        ({"tasks": ("no_such.bddl",)}, "there is no task file no_such.bddl"),
         ({"count": 0}, "--count must be at least 1, got 0"),
     ],
 )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+import warnings
 
 import numpy as np
 import pytest
@@ -104,3 +106,71 @@ def test_a_goal_without_a_script_is_refused_by_name():
     task = dataclasses.replace(load_task(BOWL), name="goal/stack", goal=(("Under", "bowl_1", "plate_1"),))
     with pytest.raises(ValueError, match="no script for goal/stack: no skill brings about Under"):
         ScriptedExpert(task)
+
+
+@pytest.mark.parametrize(
+    ("goal", "error", "message"),
+    [
+        (
+            [("On", "bowl_2", "plate_1")],
+            ValueError,
+            rf"no script for {BOWL}: it has no thing or region 'bowl_2': did .*'bowl_1'",
+        ),
+        ([("On", "bowl_1", "plat_1")], ValueError, "no thing or region 'plat_1': did you mean 'plate_1'"),
+        ([("Open", "nope")], ValueError, "no thing or region 'nope'; known are table_1, bowl_1, plate_1, table_1_"),
+        ([("Onn", "bowl_1", "plate_1")], ValueError, "no skill brings about Onn: did you mean 'On'"),
+        ([("turnon", "bowl_1")], ValueError, "no skill brings about turnon: did you mean 'TurnOn'"),
+        ([("On", "bowl_1")], ValueError, r"On takes 2 name\(s\), got \('On', 'bowl_1'\)"),
+        ([("In", "bowl_1", "plate_1")], ValueError, r"\(In bowl_1 plate_1\): plate_1 has no contain_region"),
+        ([("On", "bowl_1", "bowl_1")], ValueError, "bowl_1 cannot be put on or into itself"),
+        ([("On", "bowl_1", "table_1")], ValueError, "table_1 is the workspace: name one of its regions"),
+        ([], ValueError, "its goal is empty"),
+        (("On", "bowl_1", "plate_1"), TypeError, "a goal's predicate is a tuple of words, .* got 'On'"),
+        ("On bowl_1 plate_1", TypeError, "goal must be a sequence of predicates such as .* got 'On bowl_1 plate_1'"),
+    ],
+)
+def test_a_goal_that_cannot_be_asked_is_refused_with_what_is_close(goal, error, message):
+    with pytest.raises(error, match=message):
+        ScriptedExpert(BOWL, goal=goal)
+
+
+@pytest.mark.parametrize(
+    ("task", "error", "message"),
+    [
+        ("starter/put_the_bwl", ValueError, f"did you mean '{BOWL}'"),
+        (None, TypeError, "a task is called by its name or file, got None"),
+        ([BOWL], TypeError, r"got \['starter/put_the_bowl_on_the_plate'\]"),
+    ],
+)
+def test_a_task_that_is_none_is_refused(task, error, message):
+    with pytest.raises(error, match=message):
+        ScriptedExpert(task)
+
+
+FAR = """(define (problem study) (:domain robosuite) (:language turn on the stove)
+  (:regions (place (:target desk) (:ranges ((RANGE)))))
+  (:fixtures desk - study_table stove_1 - flat_stove) (:objects)
+  (:init (On stove_1 desk_place)) (:goal (And (TurnOn stove_1))))
+"""
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("0.30 0.0 0.31 0.01", None),
+        ("0.40 0.0 0.40 0.0", r"fails at \(TurnOn stove_1\) in row 0: .* x = 0.33, y = -0.07 .*, 8 cm out of"),
+        ("0.0 0.45 0.0 0.45", r"fails at \(TurnOn stove_1\) in row 0: .* x = -0.07, y = 0.38 .*, 3 cm out of"),
+    ],
+)
+def test_a_lever_out_of_reach_is_said_once_with_how_far_and_one_within_is_turned(place, message, tmp_path):
+    path = tmp_path / "far.bddl"
+    path.write_text(FAR.replace("RANGE", place))
+    scene = _scene(str(path), 2)
+    expert, done = ScriptedExpert(scene.task), np.zeros(2, bool)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(250):
+            scene.step(expert(scene))
+            done |= scene.success()
+    assert len(caught) == (message is not None) and done.all() == (message is None)
+    assert message is None or re.search(message, str(caught[0].message))

@@ -149,6 +149,40 @@ def test_a_goal_that_holds_from_the_start_is_refused_after_few_draws(path):
         load_task(path).init_states("train", 50)
 
 
+def test_states_stored_beside_a_file_are_its_standard_ones(path):
+    task = load_task(path)
+    drawn = task.init_states("train", 3)
+    unwanted = drawn[1:2]
+    initial.save_poses(task, task.states, 2, lambda states: (states != unwanted).any(-1))
+    assert task.states == path.with_suffix(".npz")
+    copy = path.with_name("copy.bddl")
+    copy.write_text(TEXT)
+    task.states.rename(copy.with_suffix(".npz"))
+    stored = load_task(copy).init_states("train", 3)
+    assert (stored == drawn).all(-1).tolist() == [True, False, True]  # the second was drawn again
+    assert np.array_equal(load_task(path).init_states("train", 3), drawn)
+    copy.write_text(TEXT.replace("put the bowl", "lay the bowl"))
+    remedy = r"make them again with python recipes/init_states\.py --tasks .*copy\.bddl"
+    with pytest.raises(RuntimeError, match=rf"copy\.npz holds initial states of another version of .*{remedy}"):
+        load_task(copy).init_states("train", 1)
+
+
+@pytest.mark.parametrize("content", ["arrays", "text", "nothing"])
+def test_another_file_of_that_name_is_refused_and_kept(path, content):
+    other = path.with_suffix(".npz")
+    if content == "arrays":
+        np.savez(other, train=np.zeros(3))
+    else:
+        other.write_text("mine" * (content == "text"))
+    kept, task = other.read_bytes(), load_task(path)
+    with pytest.raises(RuntimeError, match=r"two_things\.npz holds no initial states .*: move it away"):
+        task.init_states("train", 1)
+    with pytest.raises(RuntimeError, match=r"two_things\.npz holds something other than initial states .*: move it"):
+        initial.save_poses(task, other, 1)
+    assert other.read_bytes() == kept
+    assert {item.name for item in path.parent.iterdir()} == {path.name, other.name}
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nothing\.bddl"):
         load_task(tmp_path / "nothing.bddl")

@@ -104,6 +104,13 @@ def test_a_seed_gives_the_same_state_and_another_one_another():
         ("bowl_1 - bowl plate_1", "bowl_1 green_bowl plate_1", ":8: 'green_bowl': a category as the name of a plate"),
         ("(:objects bowl_1", "(:objects panda - bowl bowl_1", "'panda': .* call it panda_1"),
         ("(:objects bowl_1", "(:objects a/b - bowl bowl_1", "'a/b': a name may not hold a slash"),
+        (
+            "problem tabletop",
+            "problem libero_kitchen_tabletop_manipulation",
+            ":7: 'table_1': the workspace is a table, but .* on a kitchen_table: write 'table_1 - kitchen_table', "
+            "or another class: bench, tabletop, libero_tabletop_manipulation",
+        ),
+        ("table_1 - table", "table_1 - study_table", "is a study_table, but .*class: study, libero_study"),
         ("problem tabletop", "problem table_top", "<text>:2: 'table_top': unknown class .*did you mean 'tabletop'"),
     ],
 )

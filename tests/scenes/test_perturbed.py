@@ -82,8 +82,15 @@ def test_a_reset_draws_other_mishaps():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"early_release": 1.5}, "early_release is a probability, got 1.5"),
-        ({"noise": -1.0}, "noise must not be negative"),
+        ({"early_release": 1.5}, "early_release is a probability, got 1.5: pass a number from 0 to 1"),
+        ({"gripper_flips": float("nan")}, "gripper_flips is a probability, got nan"),
+        ({"wrong_object": -0.1}, "wrong_object is a probability, got -0.1"),
+        ({"early_release": "yes"}, "early_release is a probability, got 'yes'"),
+        ({"noise": -1.0}, "noise must be a finite number and not negative, got -1.0"),
+        ({"noise": float("nan")}, "noise must be a finite number and not negative, got nan"),
+        ({"noise": None}, "noise must be a finite number and not negative, got None"),
+        ({"seed": -1}, "seed must be a whole number of at least 0, got -1"),
+        ({"seed": 1.5}, "seed must be a whole number of at least 0, got 1.5"),
     ],
 )
 def test_impossible_settings_are_refused(options, message):

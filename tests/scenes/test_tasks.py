@@ -42,6 +42,7 @@ def test_the_starter_tasks_stand_beside_the_suites_in_the_order_of_their_ids():
         (lambda: list_tasks("gaol"), "unknown suite 'gaol': it must be one of spatial, object, goal, long, starter"),
         (lambda: load_task(BOWL).init_states("validation"), "'validation': it must be 'train' or 'test'"),
         (lambda: load_task(BOWL).init_states("train", 0), "count must be at least 1, got 0"),
+        (lambda: load_task(BOWL).init_states("train", 10**9), "count must be at most 50000, got 1000000000"),
         (lambda: load_task(BOWL).camera("sideview"), "unknown camera 'sideview'"),
     ],
 )

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import mujoco
 import numpy as np
 
-from worldenv_trl.scenes.tasks import SPLITS, Task
+from worldenv_trl.scenes.tasks import MOST_STATES, SPLITS, Task
 
 MODES = ("random", "cycle", "fixed")
 UNKNOWN_CONTEXT = -1  # a state given by the caller without a number
-_PER_TASK, _PER_SPLIT = 100_000, 50_000
+_PER_TASK, _PER_SPLIT = len(SPLITS) * MOST_STATES, MOST_STATES
 
 
 def context_id(task_id: int, split: str, index: int) -> int:
-    """The number of initial state ``index`` of a task's split; distinct over all tasks and both splits."""
+    """The number of initial state ``index`` of a task's split; distinct over all tasks and both splits.
+
+    Raises:
+        ValueError: for an index out of [0, 50,000).
+    """
+    if not 0 <= index < _PER_SPLIT:
+        raise ValueError(f"the index of an initial state must be in [0, {_PER_SPLIT}), got {index}")
     return task_id * _PER_TASK + SPLITS.index(split) * _PER_SPLIT + index
 
 
@@ -32,7 +39,9 @@ class InitStates:
         context_ids: ``[K]`` their numbers; unknown ones are -1.
 
     Raises:
-        ValueError: for an unknown mode, an index out of range, or numbers that do not match the states.
+        TypeError: for states or numbers that are none.
+        ValueError: for an unknown mode, an index out of range, states of another task's length or that hold NaN or
+            infinity, and numbers that do not match the states or name two of them.
     """
 
     def __init__(
@@ -53,12 +62,9 @@ class InitStates:
                 raise ValueError("context_ids names given init_states: pass both or neither")
             states = task.init_states(split, max(count, init_state_id + 1) if mode == "fixed" else count)
             context_ids = [context_id(task.task_id, split, index) for index in range(len(states))]
-        states = np.atleast_2d(np.asarray(states, np.float64))
-        context_ids = [UNKNOWN_CONTEXT] * len(states) if context_ids is None else [int(i) for i in context_ids]
-        if len(states) == 0 or len(context_ids) != len(states):
-            raise ValueError(
-                f"got {len(states)} init_states and {len(context_ids)} context_ids: both must be as long, at least 1"
-            )
+        else:
+            states = _given_states(task, states)
+            context_ids = [UNKNOWN_CONTEXT] * len(states) if context_ids is None else _numbers(context_ids, states)
         if not 0 <= init_state_id < len(states):
             raise ValueError(f"init_state_id must be in [0, {len(states)}), got {init_state_id}")
         self.task, self.mode, self.states, self.context_ids = task, mode, states, context_ids
@@ -98,3 +104,41 @@ class InitStates:
             )
         split, index = divmod(rest, _PER_SPLIT)
         return self.task.init_states(SPLITS[split], index + 1)[index]
+
+
+def _given_states(task: Task, states: object) -> np.ndarray:
+    """``states`` as float64 ``[K, S]``, if they are states of the task."""
+    try:
+        array = np.asarray(states)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"init_states cannot be read as an array ({error}): pass float64 [K, S]") from None
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"init_states must be numbers [K, S], got {array.dtype} {list(array.shape)}")
+    size = mujoco.mj_stateSize(task.build(), mujoco.mjtState.mjSTATE_INTEGRATION)
+    array = array[None] if array.ndim == 1 else array
+    if array.ndim != 2 or array.shape[1] != size or not len(array):
+        raise ValueError(
+            f"init_states must be [K, {size}] for {task.name}, at least one, got {list(array.shape)}: take them from "
+            "its init_states(...), or from the sim_state of an env of this task alone"
+        )
+    broken = np.flatnonzero(~np.isfinite(array).all(-1))
+    if len(broken):
+        raise ValueError(f"init_states for {task.name} hold NaN or infinity in rows {broken.tolist()}")
+    return array.astype(np.float64)
+
+
+def _numbers(context_ids: Sequence[int], states: np.ndarray) -> list[int]:
+    """``context_ids`` as a list, if they can be the numbers of ``states [K, S]``."""
+    array = np.asarray(context_ids)
+    if array.dtype.kind not in "iu" and array.size:
+        raise TypeError(f"context_ids must be whole numbers [{len(states)}], got {context_ids!r}")
+    numbers = array.reshape(-1).tolist()
+    if len(numbers) != len(states):
+        raise ValueError(f"got {len(states)} init_states and {len(numbers)} context_ids: both must be as long")
+    first: dict[int, int] = {}
+    for row, number in enumerate(numbers):
+        if number < UNKNOWN_CONTEXT:
+            raise ValueError(f"context_ids must be at least 0, or -1 for a state without a number, got {number}")
+        if number != UNKNOWN_CONTEXT and (states[first.setdefault(number, row)] != states[row]).any():
+            raise ValueError(f"context_id {number} names two different init_states, rows {first[number]} and {row}")
+    return numbers

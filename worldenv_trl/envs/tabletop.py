@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 
 from worldenv_trl.envs.init_states import UNKNOWN_CONTEXT, InitStates
 from worldenv_trl.envs.row_texts import row_texts
-from worldenv_trl.envs.tabletop_arguments import check_counts, check_whole
+from worldenv_trl.envs.tabletop_arguments import check_cameras, check_counts, check_flag, check_whole, tasks_of
 from worldenv_trl.envs.tabletop_specs import tabletop_specs
 from worldenv_trl.keys import (
     ACTION,
@@ -30,12 +30,14 @@ from worldenv_trl.keys import (
     SUCCESS,
     TASK_ID,
 )
-from worldenv_trl.scenes import RendererPool, SceneBatch, Task, load_task
+from worldenv_trl.scenes import RendererPool, SceneBatch, Task
 from worldenv_trl.scenes.simulation import measured_states, step_together
+from worldenv_trl.scenes.tasks import MOST_STATES
 
 __all__ = ["TabletopEnv"]
 
 _IMAGE_NAMES = {"agentview": "image", "wrist": "wrist_image"}  # below "observation"
+_LONGEST = 2**31 - 1  # steps
 
 
 @dataclass
@@ -68,7 +70,7 @@ class TabletopEnv(EnvBase):
         init_state_mode: ``random`` (shuffled passes), ``cycle`` (in order, reset after reset, so that every state gets
             its turn) or ``fixed``.
         init_state_id: the fixed state, or where the cycle starts.
-        init_state_count: how many states of the split take part; 50 is the standard protocol.
+        init_state_count: how many states of the split take part, at most 50,000; 50 is the standard protocol.
         init_states: float64 [K, S] to use instead of the split's (one task only), with their ``context_ids`` [K].
         group_repeats: that many consecutive rows share one initial state (the rollouts of an RLOO group).
         terminate_on_success: end a row when its goal holds; reward is 1 on that step, else 0. When False, a row runs to
@@ -89,8 +91,10 @@ class TabletopEnv(EnvBase):
     only if it was built with ``with_sim_state``.
 
     Raises:
-        ValueError: naming the unknown task, camera, split or mode, or the size out of bounds.
-        RuntimeError: if images are asked for and no GL backend works.
+        TypeError: naming the argument that is of another kind.
+        ValueError: naming the unknown task, camera, split or mode, the size out of bounds, or what is wrong with the
+            given states.
+        RuntimeError: if images are asked for and no GL backend works; from ``reset`` and ``step`` of a closed env.
 
     Examples:
         >>> env = TabletopEnv("starter/open_the_top_drawer", 4, seed=0)
@@ -122,30 +126,25 @@ class TabletopEnv(EnvBase):
         seed: int | None = None,
         num_threads: int | None = None,
     ) -> None:
-        tasks = [task] if isinstance(task, str | Path | Task) else list(task)
-        tasks = [load_task(item) if isinstance(item, str | Path) else item for item in tasks]
+        tasks = tasks_of(task)
         for name, value, low in (
             ("num_envs", num_envs, 1),
             ("group_repeats", group_repeats, 1),
-            ("init_state_id", init_state_id, 0),
-            ("init_state_count", init_state_count, 1),
-            ("max_steps", 1 if max_steps is None else max_steps, 1),
             ("num_threads", 1 if num_threads is None else num_threads, 1),
             ("seed", 0 if seed is None else seed, 0),
         ):
             check_whole(name, value, low)
+        check_whole("max_steps", 1 if max_steps is None else max_steps, 1, _LONGEST)
+        check_whole("init_state_count", init_state_count, 1, MOST_STATES, "context ids tell no more of a split apart")
+        check_whole("init_state_id", init_state_id, 0, MOST_STATES - 1, "context ids tell no more of a split apart")
+        check_flag("terminate_on_success", terminate_on_success)
+        check_flag("with_sim_state", with_sim_state)
         check_counts(tasks, num_envs, group_repeats)
         if proprio not in ("commanded", "measured"):
             raise ValueError(f"proprio must be 'commanded' or 'measured', got {proprio!r}")
         if init_states is not None and len(tasks) > 1:
             raise ValueError("init_states are of one task: build one env for each task")
-        if isinstance(cameras, str):
-            raise ValueError(f"cameras must be a sequence of names, got {cameras!r}: write ({cameras!r},)")
-        if len(set(cameras)) < len(cameras):
-            raise ValueError(f"a camera is named twice: {', '.join(cameras)}")
-        for name in cameras:
-            if name not in _IMAGE_NAMES:
-                raise ValueError(f"unknown camera {name!r}: it must be one of {', '.join(_IMAGE_NAMES)}")
+        check_cameras(cameras, _IMAGE_NAMES)
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_envs]))
         self.tasks, self.cameras, self.image_size = tuple(tasks), tuple(cameras), image_size
         self.terminate_on_success, self.proprio, self.with_sim_state = terminate_on_success, proprio, with_sim_state
@@ -225,12 +224,17 @@ class TabletopEnv(EnvBase):
         """The simulation of each task and the rows of the env it runs: privileged state, for experts and checks."""
         return [(block.scene, block.rows) for block in self._blocks]
 
+    def progress(self) -> dict[str, np.ndarray]:
+        """``task_id``, ``context_id`` and ``num_steps`` of every row as they are now, int64 [n, 1] each (copies)."""
+        return {TASK_ID: self._task.copy(), CONTEXT_ID: self._context.copy(), NUM_STEPS: self._steps.copy()}
+
     # ------------------------------------------------------------------------------------------------- reset
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
         return False  # a state is honoured when set_state=True asks for it, never because it happens to be there
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDictBase:
+        self._check_open()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = np.ones(self.num_envs, bool) if mask is None else mask.reshape(-1).numpy()
         # Rows reset together stay in step, so that the rows of a group share their initial states.
@@ -290,6 +294,7 @@ class TabletopEnv(EnvBase):
     # ------------------------------------------------------------------------------------------------- step
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._check_open()
         active = tensordict.get("_step", None)
         active = np.ones(self.num_envs, bool) if active is None else active.reshape(-1).numpy()
         action = self._checked_action(tensordict, active)
@@ -367,9 +372,7 @@ class TabletopEnv(EnvBase):
         out = {
             "observation": {name: torch.from_numpy(value) for name, value in copies.items()},
             KINEMATIC_STATE: torch.from_numpy(self._kinematic.copy()),
-            TASK_ID: torch.from_numpy(self._task.copy()),
-            CONTEXT_ID: torch.from_numpy(self._context.copy()),
-            NUM_STEPS: torch.from_numpy(self._steps.copy()),
+            **{key: torch.from_numpy(value) for key, value in self.progress().items()},
             SUCCESS: torch.from_numpy(self._success.copy()),
         }
         if self.with_sim_state:
@@ -380,6 +383,10 @@ class TabletopEnv(EnvBase):
         out = TensorDict(out, batch_size=self.batch_size, device=self.device)
         out.set(INSTRUCTION, self._text)
         return out
+
+    def _check_open(self) -> None:
+        if self.is_closed:
+            raise RuntimeError("this TabletopEnv was closed, its renderers and threads are gone: build another one")
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         if not self.is_closed:

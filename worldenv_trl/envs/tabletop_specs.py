@@ -7,18 +7,7 @@ from collections.abc import Mapping
 import torch
 from torchrl.data import Binary, Bounded, Composite, NonTensor, Unbounded
 
-from worldenv_trl.keys import (
-    ACTION_DIM,
-    CONTEXT_ID,
-    INSTRUCTION,
-    KINEMATIC_DIM,
-    KINEMATIC_STATE,
-    NUM_STEPS,
-    SIM_STATE,
-    STATE_DIM,
-    SUCCESS,
-    TASK_ID,
-)
+from worldenv_trl import keys
 
 __all__ = ["tabletop_specs"]
 
@@ -52,18 +41,18 @@ def tabletop_specs(
         name: Bounded(0, 255, shape=(*batch, *shape), dtype=torch.uint8, device=cpu) for name, shape in images.items()
     }
     observation = {
-        "observation": nested({**pixels, "state": real(STATE_DIM)}),
-        KINEMATIC_STATE: real(KINEMATIC_DIM),
-        INSTRUCTION: NonTensor(shape=batch, example_data=language, device=cpu),
-        TASK_ID: integer(),
-        CONTEXT_ID: integer(),
-        NUM_STEPS: integer(),
-        SUCCESS: flag(),
+        "observation": nested({**pixels, "state": real(keys.STATE_DIM)}),
+        keys.KINEMATIC_STATE: real(keys.KINEMATIC_DIM),
+        keys.INSTRUCTION: NonTensor(shape=batch, example_data=language, device=cpu),
+        keys.TASK_ID: integer(),
+        keys.CONTEXT_ID: integer(),
+        keys.NUM_STEPS: integer(),
+        keys.SUCCESS: flag(),
     }
-    state = {CONTEXT_ID: integer(), NUM_STEPS: integer()}
+    state = {keys.CONTEXT_ID: integer(), keys.NUM_STEPS: integer()}
     if sim_size is not None:
-        observation[SIM_STATE] = Unbounded(shape=(*batch, sim_size), dtype=torch.float64, device=cpu)
-        state[SIM_STATE] = observation[SIM_STATE].clone()
-    action = Bounded(-1.0, 1.0, shape=(*batch, ACTION_DIM), device=cpu)
+        observation[keys.SIM_STATE] = Unbounded(shape=(*batch, sim_size), dtype=torch.float64, device=cpu)
+        state[keys.SIM_STATE] = observation[keys.SIM_STATE].clone()
+    action = Bounded(-1.0, 1.0, shape=(*batch, keys.ACTION_DIM), device=cpu)
     done = nested({"done": flag(), "terminated": flag(), "truncated": flag()})
     return nested(observation), nested(state), action, real(1), done

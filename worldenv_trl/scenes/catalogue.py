@@ -31,12 +31,18 @@ def list_tasks(suite: str) -> list[str]:
 def load_task(name: str | Path) -> FileTask:
     """The task called ``suite/name``, or that of a file ``path.bddl``.
 
+    Its standard initial states are those stored beside the file, ``path.npz``, if there are any
+    (``recipes/init_states.py`` makes them); all others are drawn when they are asked for.
+
     Raises:
+        TypeError: for what is no name.
         ValueError: with the closest names for an unknown task; for a file that cannot be read, laid out or judged.
         FileNotFoundError: if there is no such file.
     """
+    if not isinstance(name, str | Path):
+        raise TypeError(f"a task is called by its name or file, got {name!r}: try 'starter/open_the_top_drawer'")
     if str(name).endswith(".bddl"):
-        return load_bddl(name)
+        return load_bddl(name, states=Path(name).with_suffix(".npz"))
     if name in _MAX_STEPS:
         raise ValueError(f"{name!r} is a suite: name tasks of it, for instance {list_tasks(str(name))[0]!r}")
     if name not in _known():

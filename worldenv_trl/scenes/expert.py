@@ -5,6 +5,7 @@ Each step it looks at the true state again, so actions disturbed from outside ar
 
 from __future__ import annotations
 
+import warnings
 from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import accumulate
@@ -18,11 +19,13 @@ from worldenv_trl.scenes import controller
 from worldenv_trl.scenes.catalogue import load_task
 from worldenv_trl.scenes.files import FileTask
 from worldenv_trl.scenes.plan import plan_stages
+from worldenv_trl.scenes.reach import out_of_reach
+from worldenv_trl.scenes.settings import setting_of
 from worldenv_trl.scenes.skills.phase import nearest_yaw
+from worldenv_trl.scenes.tasks import Task
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.simulation import SceneBatch
-    from worldenv_trl.scenes.tasks import Task
 
 _DOWN = np.diag([1.0, -1.0, -1.0])  # the hand points straight down, fingers open along y
 _PATIENCE = 12  # steps after the last phase until what does not hold is done again
@@ -38,14 +41,18 @@ class ScriptedExpert:
 
     Keyword Args:
         goal: what to do instead of the task's goal, in the same form.
+        warn: say, once for each predicate of the goal, that it fails because something lies out of the arm's reach.
 
     Raises:
-        ValueError: for a goal that its skills cannot reach, and a task that no file describes.
+        TypeError: for what is no task, or no list of predicates.
+        ValueError: for a goal that its skills cannot reach or that names what is not there, and a task that no file
+            describes.
     """
 
-    def __init__(self, task: Task | str | Path, *, goal: Sequence[tuple[str, ...]] | None = None) -> None:
-        if isinstance(task, str | Path):
-            task = load_task(task)
+    def __init__(
+        self, task: Task | str | Path, *, goal: Sequence[tuple[str, ...]] | None = None, warn: bool = True
+    ) -> None:
+        task = task if isinstance(task, Task) else load_task(task)
         if not isinstance(task, FileTask):
             raise ValueError(
                 f"no script for {task.name}: the expert plans from a task file (load_task), not from a class"
@@ -55,6 +62,7 @@ class ScriptedExpert:
         self._ends = list(accumulate(len(stage.phases) for stage in self._stages))
         self.phases = [phase for stage in self._stages for phase in stage.phases]
         self.phase: np.ndarray | None = None
+        self._warn, self._said = warn, set()  # stages that were said to be out of reach
 
     def reset(self, rows: np.ndarray | None = None) -> None:
         """Starts ``rows`` (default: all) from the first phase."""
@@ -62,7 +70,7 @@ class ScriptedExpert:
             self.phase = None
         elif self.phase is not None:
             self.phase[rows], self._dwell[rows], self._spent[rows], self._memory[rows] = 0, 0, 0, np.nan
-            self._yaw[rows] = 0.0
+            self._yaw[rows], self._missed[rows], self._failed[rows] = 0.0, np.nan, False
 
     def __call__(self, scene: SceneBatch) -> np.ndarray:
         """Actions ``[n, 7]`` in [-1, 1] for the current state of every row."""
@@ -70,6 +78,7 @@ class ScriptedExpert:
         if self.phase is None or len(self.phase) != n:
             self.phase, self._dwell, self._spent = (np.zeros(n, int) for _ in range(3))
             self._memory, self._yaw = np.full((n, 3), np.nan), np.zeros(n)
+            self._missed, self._failed = np.full((n, len(self._stages), 3), np.nan), np.zeros(n, bool)
         position = scene.measured_state()[:, :3].astype(float)
         targets = scene.batch.bind("userdata")
         commanded = targets[:, 3:12].reshape(-1, 3, 3)
@@ -103,11 +112,14 @@ class ScriptedExpert:
             if index == len(self.phases) - 1:
                 ready = self._again(scene, rows, following)
             else:
+                self._note_misses(index, goal, ready & ~arrived)
                 following[ready] += 1
             if phase.still is not None:
                 lost = rows & ~phase.still(scene)
                 if lost.any():
-                    following[lost] = np.where(self._done(scene, index), self._let_go(index), phase.again)[lost]
+                    done = self._done(scene, index)
+                    self._say_why(bisect_right(self._ends, index), lost & ~done)
+                    following[lost] = np.where(done, self._let_go(index), phase.again)[lost]
                     ready |= lost
             self._dwell[ready], self._spent[ready], self._memory[ready] = 0, 0, np.nan
         self.phase = following
@@ -132,6 +144,31 @@ class ScriptedExpert:
         """``[n]``: what the phase's stage is for holds already."""
         return self._relations.evaluate(scene, *self._stages[bisect_right(self._ends, index)].aim)
 
+    def _note_misses(self, index: int, goal: np.ndarray, given_up: np.ndarray) -> None:
+        """Keeps where rows have ``given_up [n]`` a phase because its ``goal [n, 3]`` is out of the arm's reach.
+
+        In the first attempt only: in a later one things may lie where the hand has pushed them.
+        """
+        if given_up.any():
+            missed = given_up & ~self._failed & (out_of_reach(goal) > self.phases[index].tolerance)
+            self._missed[missed, bisect_right(self._ends, index)] = goal[missed]
+
+    def _say_why(self, stage: int, failed: np.ndarray) -> None:
+        """Warns, once for each stage, if rows that ``failed [n]`` at it could not reach where they had to be."""
+        self._failed |= failed
+        rows = np.flatnonzero(failed & ~np.isnan(self._missed[:, stage, 0]))
+        if not self._warn or stage in self._said or not len(rows):
+            return
+        self._said.add(stage)
+        goal = self._missed[rows[:1], stage]
+        far, (x, y) = 100 * out_of_reach(goal)[0], goal[0, :2] - setting_of(self.task.problem).origin
+        warnings.warn(
+            f"{self.task.name}: the expert fails at ({' '.join(self._stages[stage].aim)}) in row {rows[0]}: the hand "
+            f"would have to be at x = {x:.2f}, y = {y:.2f} of the workspace, {far:.0f} cm out of the arm's reach; move "
+            "the thing, or where it belongs, in the task file",
+            stacklevel=2,
+        )
+
     def _let_go(self, index: int) -> int:
         """The last but one phase of the same stage: the hand opens and leaves."""
         return max(index, self._ends[bisect_right(self._ends, index)] - 2)
@@ -142,8 +179,9 @@ class ScriptedExpert:
         if not waited.any():
             return waited
         left = waited.copy()
-        for stage, start in zip(self._stages, (0, *self._ends), strict=False):
+        for number, (stage, start) in enumerate(zip(self._stages, (0, *self._ends), strict=False)):
             failed = left & ~self._relations.evaluate(scene, *stage.aim)
+            self._say_why(number, failed)
             following[failed] = start
             left &= ~failed
         return waited

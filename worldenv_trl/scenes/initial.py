@@ -6,6 +6,9 @@ read from a file are the same, bit for bit.
 
 from __future__ import annotations
 
+import os
+import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -111,22 +114,28 @@ def load_poses(task: FileTask, path: Path) -> dict[str, np.ndarray]:
     """The stored poses ``[n, P]`` of each split.
 
     Raises:
-        RuntimeError: if the file belongs to another version of the task.
+        RuntimeError: if the file belongs to another version of the task, or holds something else.
     """
-    with np.load(path, allow_pickle=False) as stored:
-        poses = {split: stored[split] for split in SPLITS}
-        digest = int(stored["digest"])
+    remedy = f"python recipes/init_states.py --tasks {task.name}"
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            poses = {split: stored[split] for split in SPLITS}
+            digest = int(stored["digest"])
+    except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise RuntimeError(
+            f"{path} holds no initial states ({error}), and where it lies those of {task.name} are looked for: move it "
+            f"away; {remedy} makes new ones"
+        ) from error
     width = len(_free(task.build())) + 7 * task.build().nmocap
     if digest != task.digest or any(array.shape[1:] != (width,) for array in poses.values()):
         raise RuntimeError(
-            f"{path.name} holds initial states of another version of {task.name}: make them again with "
-            "python recipes/init_states.py"
+            f"{path.name} holds initial states of another version of {task.name}: make them again with {remedy}"
         )
     return poses
 
 
 def save_poses(task: FileTask, path: Path, count: int, check: Check | None = None) -> dict[str, np.ndarray]:
-    """Draws ``count`` states of each split and writes their poses.
+    """Draws ``count`` states of each split and writes their poses, in place of what ``path`` held.
 
     A state that ``check`` refuses is drawn again, by the next generator of the same number; the others stay as they
     are.
@@ -135,11 +144,30 @@ def save_poses(task: FileTask, path: Path, count: int, check: Check | None = Non
         For each split, how often each state was drawn again because of ``check``, ``[count]``.
 
     Raises:
-        RuntimeError: as :func:`draw_poses`, and if ``check`` refuses ten draws of a state; nothing is written then.
+        RuntimeError: as :func:`draw_poses`, if ``check`` refuses ten draws of a state, and if ``path`` holds something
+            other than initial states; nothing is written then.
     """
+    if path.exists() and not _holds_states(path):
+        raise RuntimeError(f"{path} holds something other than initial states of {task.name}: move it away first")
     drawn = {split: _draw(task, split, 0, count, check) for split in SPLITS}
-    np.savez_compressed(path, digest=np.int64(task.digest), **{split: poses for split, (poses, _) in drawn.items()})
+    poses = {split: poses for split, (poses, _) in drawn.items()}
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with unfinished.open("wb") as file:
+            np.savez_compressed(file, digest=np.int64(task.digest), **poses)
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
     return {split: refusals for split, (_, refusals) in drawn.items()}
+
+
+def _holds_states(path: Path) -> bool:
+    """Whether a file holds initial states, of whatever task and version."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return {"digest", *SPLITS} == set(stored)
+    except (TypeError, ValueError, EOFError, zipfile.BadZipFile):
+        return False
 
 
 def _check_some_settle(task: FileTask, away: np.ndarray, upright: np.ndarray, solved: np.ndarray, draws: int) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,8 +41,8 @@ class PerturbedExpert:
         seed: of all of these.
 
     Raises:
-        ValueError: for a probability out of [0, 1], a negative noise, or ``wrong_object`` where nothing else can be
-            gripped and put there.
+        ValueError: for a probability out of [0, 1], a noise that is negative or not finite, a seed below 0, or
+            ``wrong_object`` where nothing else can be gripped and put there.
     """
 
     def __init__(
@@ -55,14 +57,16 @@ class PerturbedExpert:
     ) -> None:
         chances = {"gripper_flips": gripper_flips, "early_release": early_release, "wrong_object": wrong_object}
         for name, value in chances.items():
-            if not 0.0 <= value <= 1.0:
-                raise ValueError(f"{name} is a probability, got {value}")
-        if noise < 0.0:
-            raise ValueError(f"noise must not be negative, got {noise}")
+            if not isinstance(value, Real) or not 0.0 <= value <= 1.0:
+                raise ValueError(f"{name} is a probability, got {value!r}: pass a number from 0 to 1")
+        if not isinstance(noise, Real) or not 0.0 <= noise < math.inf:
+            raise ValueError(f"noise must be a finite number and not negative, got {noise!r}")
+        if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
+            raise ValueError(f"seed must be a whole number of at least 0, got {seed!r}")
         self.noise, self.gripper_flips, self.early_release = noise, gripper_flips, early_release
         self.wrong_object, self.seed = wrong_object, seed
-        self._right = ScriptedExpert(task)
-        self._wrong = ScriptedExpert(task, goal=_wrong_goal(self._right.task)) if wrong_object else None
+        self._right = ScriptedExpert(task, warn=False)
+        self._wrong = ScriptedExpert(task, goal=_wrong_goal(self._right.task), warn=False) if wrong_object else None
         self._rngs: list[np.random.Generator] = []
 
     def reset(self, rows: np.ndarray | None = None) -> None:

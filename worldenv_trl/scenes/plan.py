@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import difflib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from worldenv_trl.scenes import skills
+from worldenv_trl.scenes.bddl import PREDICATES
 from worldenv_trl.scenes.files import FileTask
 from worldenv_trl.scenes.skills import Phase
 
@@ -32,9 +34,11 @@ def plan_stages(task: FileTask, goal: Sequence[tuple[str, ...]]) -> list[Stage]:
     A drawer that is shut and that something has to go into is opened, whether the goal asks for it or not.
 
     Raises:
-        ValueError: for a predicate or thing that no skill is for, naming the task.
+        TypeError: for a goal that is no sequence of predicates.
+        ValueError: for a predicate or thing that is not there or that no skill is for, naming the task.
     """
-    asked = sorted(goal, key=lambda aim: _ORDER.get(aim[0], 9))
+    _check_goal(task, goal)
+    asked = sorted(map(tuple, goal), key=lambda aim: _ORDER[aim[0]])
     places = Counter(aim[2] for aim in asked if aim[0] in ("On", "In"))
     opened = {first for predicate, first, *_ in task.problem.init if predicate == "Open"}
     stages: list[Stage] = []
@@ -50,15 +54,45 @@ def plan_stages(task: FileTask, goal: Sequence[tuple[str, ...]]) -> list[Stage]:
             slot = _slot(task, owner, part, taken[place], places[place])
             taken[place] += 1
             _add(stages, task, aim, slot)
-        elif predicate in _ORDER:
+        else:
             if aim in task.problem.init or (predicate == "Open" and first in opened):
                 continue
             if predicate == "Open":
                 opened.add(first)
             _add(stages, task, aim)
-        else:
-            raise ValueError(f"no script for {task.name}: no skill brings about {predicate}")
     return stages
+
+
+def _check_goal(task: FileTask, goal: Sequence[tuple[str, ...]]) -> None:
+    """Raises ``TypeError`` or ``ValueError`` for a goal that cannot be asked of the task's things."""
+    example = "goal=[('On', 'bowl_1', 'plate_1')]"
+    if isinstance(goal, str) or not isinstance(goal, Sequence):
+        raise TypeError(f"goal must be a sequence of predicates such as {example}, got {goal!r}")
+    if not goal:
+        raise ValueError(f"no script for {task.name}: its goal is empty; name a predicate, as in {example}")
+    known = [*task.problem.fixtures, *task.problem.objects, *task.problem.regions]
+    for aim in goal:
+        if isinstance(aim, str) or not isinstance(aim, Sequence) or not all(isinstance(word, str) for word in aim):
+            raise TypeError(f"a goal's predicate is a tuple of words, as in {example}, got {aim!r} in {goal!r}")
+        predicate, names = aim[0] if aim else "", aim[1:]
+        if predicate not in _ORDER:
+            message = f"no skill brings about {predicate}{_hint(predicate, _ORDER)}"
+            raise ValueError(f"no script for {task.name}: {message}")
+        if len(names) != PREDICATES[predicate.lower()][1]:
+            message = f"{predicate} takes {PREDICATES[predicate.lower()][1]} name(s), got {tuple(aim)}"
+            raise ValueError(f"no script for {task.name}: {message}")
+        for name in names:
+            if name not in known:
+                raise ValueError(f"no script for {task.name}: it has no thing or region {name!r}{_hint(name, known)}")
+        if predicate in ("On", "In") and (message := task.relations.why_not(*aim)):
+            raise ValueError(f"no script for {task.name}: ({' '.join(aim)}): {message}")
+
+
+def _hint(word: str, known: Iterable[str]) -> str:
+    """Up to three of the ``known`` that are close to ``word``, or all of them, to end a message with."""
+    alike = [other for other in known if other.lower() == word.lower()]
+    close = alike or difflib.get_close_matches(word, known, n=3, cutoff=0.6)
+    return f": did you mean {' or '.join(map(repr, close))}?" if close else f"; known are {', '.join(known)}"
 
 
 def _add(stages: list[Stage], task: FileTask, aim: tuple[str, ...], slot: tuple[float, float] = (0.0, 0.0)) -> None:

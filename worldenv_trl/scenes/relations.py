@@ -68,19 +68,18 @@ class Relations:
         self.origin = np.array((*origin, 0.0))
         self._data = mujoco.MjData(model)
         for whole in problem.goal:
-            if whole[0] in ("On", "In"):
-                self._check_place(*whole)
-            else:
+            if whole[0] not in ("On", "In"):
                 joint_of(problem, entities, "goal", whole)
+            elif message := self.why_not(*whole):
+                raise problem.error("goal", *whole, message=message)
 
-    def _check_place(self, predicate: str, thing: str, place: str) -> None:
-        """Raises :class:`BDDLError` for a place where nothing can ever be."""
-        here = ("goal", predicate, thing, place)
+    def why_not(self, predicate: str, thing: str, place: str) -> str | None:
+        """Why ``On`` or ``In`` can never hold of ``thing`` and ``place``, or None; ``BDDLError`` for no such region."""
         if thing not in self.problem.objects:
             why = "is a fixture, which never moves" if thing in self.entities else "is not a thing"
-            raise self.problem.error(*here, message=f"{thing} {why}: it cannot be put somewhere")
+            return f"{thing} {why}: it cannot be put somewhere"
         if place not in self.entities and place not in self.problem.regions:
-            raise self.problem.error(*here, message=f"{place} is the workspace: name one of its regions")
+            return f"{place} is the workspace: name one of its regions"
         owner, part = self.part(place)
         message = None
         if owner == thing:
@@ -99,8 +98,7 @@ class Relations:
             x_low, y_low, x_high, y_high = self.problem.regions[place].ranges[0]
             if x_low == x_high or y_low == y_high:
                 message = f"the first range of {place} is a line or a point: nothing can stand within it"
-        if message is not None:
-            raise self.problem.error(*here, message=message)
+        return message
 
     def holds(self, scene: SceneBatch) -> np.ndarray:
         """``[n]`` bool: the whole goal holds in the current state of each row."""

@@ -28,11 +28,12 @@ _TAKEN = ("panda", "scene")
 
 @dataclass(frozen=True)
 class Setting:
-    """Colours, materials and camera, and where the workspace's (0, 0) lies on our table.
+    """The category of the workspace, where its (0, 0) lies on our table, colours, materials and camera.
 
     The robot stands at the same place in all of them; LIBERO's workspaces begin at other distances from it.
     """
 
+    workspace: str
     base_distance: float
     table: Color
     wall: Color
@@ -46,13 +47,15 @@ class Setting:
 
 
 _WIDE = look_at("agentview", (0.86, 0.0, 0.80), (-0.09, 0.0, 0.05), 36.0)
-_TABLETOP = Setting(0.66, (0.72, 0.70, 0.66, 1), (0.45, 0.52, 0.50, 1), _WIDE)
-_KITCHEN = Setting(0.66, (0.62, 0.64, 0.60, 1), (0.78, 0.70, 0.48, 1), _WIDE, TILES, WALL_TILES)
-_LIVING_ROOM = Setting(0.51, (0.55, 0.42, 0.32, 1), (0.62, 0.60, 0.64, 1), _WIDE, BOARDS, WALLPAPER)
-_STUDY = Setting(0.55, (0.66, 0.58, 0.48, 1), (0.40, 0.44, 0.55, 1), _WIDE, GRAIN, PLASTER)
-_FLOOR = Setting(0.60, (0.60, 0.62, 0.64, 1), (0.50, 0.46, 0.42, 1), _WIDE, PARQUET, PLASTER)
+_TABLETOP = Setting("table", 0.66, (0.72, 0.70, 0.66, 1), (0.45, 0.52, 0.50, 1), _WIDE)
+_KITCHEN = Setting("kitchen_table", 0.66, (0.62, 0.64, 0.60, 1), (0.78, 0.70, 0.48, 1), _WIDE, TILES, WALL_TILES)
+_LIVING_ROOM = Setting(
+    "living_room_table", 0.51, (0.55, 0.42, 0.32, 1), (0.62, 0.60, 0.64, 1), _WIDE, BOARDS, WALLPAPER
+)
+_STUDY = Setting("study_table", 0.55, (0.66, 0.58, 0.48, 1), (0.40, 0.44, 0.55, 1), _WIDE, GRAIN, PLASTER)
+_FLOOR = Setting("floor", 0.60, (0.60, 0.62, 0.64, 1), (0.50, 0.46, 0.42, 1), _WIDE, PARQUET, PLASTER)
 
-_BENCH = Setting(-panda.BASE_POSITION[0], (0.72, 0.70, 0.66, 1), (0.45, 0.52, 0.50, 1), AGENTVIEW)
+_BENCH = Setting("table", -panda.BASE_POSITION[0], (0.72, 0.70, 0.66, 1), (0.45, 0.52, 0.50, 1), AGENTVIEW)
 
 SETTINGS: Mapping[str, Setting] = MappingProxyType(
     {
@@ -87,8 +90,8 @@ def compile_scene(problem: Problem) -> tuple[dict[str, Primitive], mujoco.MjMode
     """The things of a task file by name, and the scene they make up.
 
     Raises:
-        BDDLError: for an unknown problem class or category, a fixture among the objects or an object among the
-            fixtures, or a region off the table, naming file and line.
+        BDDLError: for an unknown problem class or category, a workspace of another class, a fixture among the objects
+            or an object among the fixtures, or a region off the table, naming file and line.
     """
     setting = setting_of(problem)
     arena = TabletopArena(
@@ -103,6 +106,7 @@ def compile_scene(problem: Problem) -> tuple[dict[str, Primitive], mujoco.MjMode
         for name, category in named.items():
             _check_instance(problem, name, category, fixture=named is problem.fixtures)
             if category in WORKSPACES:
+                _check_workspace(problem, name, category)
                 continue
             try:
                 entities[name] = make_entity(category, name)
@@ -132,6 +136,18 @@ def _check_instance(problem: Problem, name: str, category: str, *, fixture: bool
         here, there = (":fixtures", ":objects") if fixture else (":objects", ":fixtures")
         why = "stands still" if stands else "can be moved"
         raise problem.error("thing", name, message=f"a {category} {why}: declare it under {there}, not {here}")
+
+
+def _check_workspace(problem: Problem, name: str, category: str) -> None:
+    """Regions are measured from the middle of the class's own workspace: in another they would mean other places."""
+    own = setting_of(problem).workspace
+    if category != own:
+        kinds = [kind for kind, setting in SETTINGS.items() if setting.workspace == category]
+        message = (
+            f"the workspace is a {category}, but (problem {problem.kind}) plays on a {own}: write '{name} - {own}', "
+            f"or another class: {', '.join(kinds)}"
+        )
+        raise problem.error("thing", name, message=message)
 
 
 def _check_region(problem: Problem, region: Region, origin: tuple[float, float], half_size: Sequence[float]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from numbers import Integral
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -53,9 +54,9 @@ class SceneBatch:
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        if not isinstance(image_size, int) or not 16 <= image_size <= _LARGEST_IMAGE:
+        if not isinstance(image_size, Integral) or not 16 <= image_size <= _LARGEST_IMAGE:
             raise ValueError(f"image_size must be a whole number from 16 to {_LARGEST_IMAGE} px, got {image_size!r}")
-        self.task, self.num_envs, self.image_size = task, num_envs, image_size
+        self.task, self.num_envs, self.image_size = task, num_envs, int(image_size)
         self.model = task.build()
         known = {_short_name(full): full for full in (self.model.camera(i).name for i in range(self.model.ncam))}
         for name in cameras:
@@ -78,7 +79,9 @@ class SceneBatch:
         if cameras:
             self._own_pool = RendererPool(min(threads, num_envs)) if pool is None else None
             names = [known[name] for name in cameras]
-            self.drawing = (pool or self._own_pool).add(self.model, names, image_size, num_envs, task.glows(self.model))
+            self.drawing = (pool or self._own_pool).add(
+                self.model, names, self.image_size, num_envs, task.glows(self.model)
+            )
 
     def reset(self, rows: np.ndarray, sim_state: np.ndarray) -> None:
         """Puts ``rows [k]`` into integration states ``sim_state [k, S]``, exactly.

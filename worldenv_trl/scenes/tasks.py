@@ -17,9 +17,10 @@ from worldenv_trl.scenes.canvas import Glow
 if TYPE_CHECKING:
     from worldenv_trl.scenes.simulation import SceneBatch
 
-__all__ = ["SPLITS", "Task"]
+__all__ = ["MOST_STATES", "SPLITS", "Task"]
 
 SPLITS = ("train", "test")
+MOST_STATES = 50_000  # of a split: so many numbers are set aside for it, and beyond them begin another's
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Task(abc.ABC):
         all solved by the scripted expert; states beyond them are drawn untried.
 
         Raises:
-            ValueError: for an unknown split or a count below 1.
+            ValueError: for an unknown split or a count that is not from 1 to 50,000.
             RuntimeError: if things cannot be placed without overlap, naming the last one tried.
         """
 
@@ -73,3 +74,5 @@ class Task(abc.ABC):
             raise ValueError(f"unknown split {split!r}: it must be 'train' or 'test'")
         if count < 1:
             raise ValueError(f"count must be at least 1, got {count}")
+        if count > MOST_STATES:
+            raise ValueError(f"count must be at most {MOST_STATES}, got {count}: no more initial states are numbered")
