@@ -78,10 +78,6 @@ class McapScan:
         self._use_copy()
 
     @property
-    def truncated(self) -> bool:
-        return _TRUNCATED in self.losses
-
-    @property
     def intact(self) -> bool:
         return not self.losses
 
