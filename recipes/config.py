@@ -157,6 +157,11 @@ class WorldEnvConfig:
 
     The scale head learns what is left on the demonstrations, a few hundredths of what the policy is off elsewhere:
     without a floor the rollouts of a group all end alike and LOOP learns nothing."""
+    scale_share: float = 0.125
+    """The scale of a dimension is at least this share of the half-range that the demonstrations use of it, too.
+
+    Where they turn the hand, noise that suits rotations they never use is so small that the smallest update exceeds
+    ``post_train.max_kl``."""
     train_states: int = 50
     """Training initial states of each task that exploration starts from, and LOOP after it. 50 is the standard; another
     one costs a rollout of exploration, no demonstration."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -69,6 +68,8 @@ def check_config(config: WorldEnvConfig) -> None:
             raise ValueError(f"{name} must lie between 0 and 1, got {value}")
     if not all(floor > 0 for floor in config.scale_floor):
         raise ValueError(f"scale_floor must be positive, got {config.scale_floor}")
+    if not 0 <= config.scale_share <= 1:
+        raise ValueError(f"scale_share must lie between 0 and 1, got {config.scale_share}")
     if config.image_size < 32 or config.image_size % 16:
         raise ValueError(f"image_size must be a multiple of 16 px and at least 32, got {config.image_size}")
     if config.max_steps < 1 or config.max_steps % config.chunk_length:
@@ -159,8 +160,9 @@ def chunk_player(actor, chunk_length: int) -> MultiStepActorWrapper:
 
 def exploring_actor(config: WorldEnvConfig, policy: OFTPolicy, scale_factor: float) -> LaplaceActor:
     """The stochastic actor of exploration and LOOP, its scale bounded below."""
-    position, rotation, gripper = (math.log(floor) for floor in config.scale_floor)
-    low = (*3 * [position], *3 * [rotation], gripper)
+    position, rotation, gripper = config.scale_floor
+    floors = torch.tensor([*3 * [position], *3 * [rotation], gripper])
+    low = torch.maximum(floors, config.scale_share * policy.action_half_range.cpu()).log().tolist()
     # The upper bound stays above every floor, whatever the floors are set to.
     return laplace_actor(policy, scale_factor=scale_factor, log_scale_bounds=(low, max(-1.5, *(x + 1 for x in low))))
 
