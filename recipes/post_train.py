@@ -34,6 +34,13 @@ from worldenv_trl.objectives import LOOPLoss, rloo_advantage
 from worldenv_trl.policies import laplace_actor
 from worldenv_trl.record import RolloutWriter
 
+_PATIENCE = 3  # iterations
+_STUCK = (
+    "warning: {}, iteration {}: for {} iterations the first update alone has moved the policy by more than max_kl={}, "
+    "so nearly nothing is learned: the scale of a dimension may be too small for how far its mean moves "
+    "(--scale-floor, --scale-share), or the learning rates too large"
+)
+
 
 def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, models: str) -> None:
     """Improves checkpoint ``source`` in the world model and reflector of round ``models``; writes ``target``."""
@@ -72,6 +79,7 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
     probed = _probed_iterations(settings)
     alarm = HonestyAlarm(len(probed), false_alarm_rate=settings.false_alarm_rate) if probed and imagination else None
     progress, started = tqdm(collector, total=settings.iterations, desc=target, unit="it"), time.monotonic()
+    stuck = 0
     for iteration, wave in enumerate(progress):
         factor = _rate_factor(iteration, settings)
         for group, rate in zip(optimizer.param_groups, full_rates, strict=True):
@@ -98,6 +106,9 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
         if iteration in (0, settings.iterations - 1):  # of the weights that collected it
             about = recording(config, env, target, {"policy": policy} | judges, iteration=iteration)
         metrics = _update(decisions, total_steps, loss, optimizer, [lora, heads], settings)
+        stuck = _stuck(stuck, metrics)
+        if stuck == _PATIENCE:
+            progress.write(_STUCK.format(target, iteration, stuck, settings.max_kl))
         if about:
             decisions = wave.reshape(-1).split(settings.minibatch_size)
             wave.update(torch.cat([loss.ratios(part) for part in decisions]).reshape(wave.shape))
@@ -151,6 +162,11 @@ def _update(decisions, total_steps, loss, optimizer, parameter_groups, settings)
         if stopped:
             break
     return {name: value / max(count, 1) for name, value in sums.items()} | {"updates": count, "kl_stop": float(stopped)}
+
+
+def _stuck(before: int, metrics: dict[str, float]) -> int:
+    """Iterations in a row, this one included, whose first update alone went too far."""
+    return before + 1 if metrics["kl_stop"] and metrics["updates"] <= 1 else 0
 
 
 def _wave_metrics(wave, returns) -> dict[str, float]:

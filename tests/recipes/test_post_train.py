@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 import post_train
 from config import PRESETS, PostTrain
+from parts import exploring_actor
+from worldenv_trl import keys
 from worldenv_trl.metrics import HonestyAlarm
+from worldenv_trl.policies import OFTConfig, OFTPolicy
 
 
 def test_the_first_and_the_last_iteration_are_probed():
@@ -32,3 +36,30 @@ def test_without_a_world_model_there_is_nothing_to_distrust(monkeypatch):
     monkeypatch.setattr(post_train, "physics_outcomes", lambda *_, **__: torch.tensor([True, False]))
     logged = post_train._probe(PRESETS["smoke"][1], None, None, None)
     assert logged == {"real_success": 0.5, "probe_episodes": 6}
+
+
+def test_iterations_that_stop_after_their_first_update_are_counted_and_said():
+    logged = [(1, 1.0), (18, 0.0), (1, 1.0), (0, 1.0), (1, 1.0), (1, 0.0)]
+    counts, stuck = [], 0
+    for updates, kl_stop in logged:
+        stuck = post_train._stuck(stuck, {"updates": updates, "kl_stop": kl_stop})
+        counts.append(stuck)
+    assert counts == [1, 0, 1, 2, 3, 0]
+    said = post_train._STUCK.format("post_train", 4, 3, 0.1)
+    assert "for 3 iterations the first update alone has moved the policy by more than max_kl=0.1" in said
+
+
+def test_the_scale_is_bounded_below_by_what_the_demonstrations_use_of_each_dimension():
+    torch.manual_seed(0)
+    policy = OFTPolicy(OFTConfig.for_tasks({0: "do it"}, dim=32, depth=1))
+    half = torch.tensor([0.2, 0.3, 0.4, 0.0, 0.0, 0.16, 1.0])  # the hand turns about one axis
+    policy.fit_statistics(torch.rand(500, 7), half * (2 * torch.rand(500, 7) - 1))
+    torch.nn.init.constant_(policy.scale_head.linear_out.bias, -20.0)  # a scale head that is far too sure
+    actor = exploring_actor(PRESETS["smoke"][1], policy, 1.0)
+    batch = {"observation": {"image": torch.zeros(2, 3, 64, 64, dtype=torch.uint8), "state": torch.zeros(2, 7)}}
+    scale = actor(TensorDict({**batch, keys.TASK_ID: torch.zeros(2, 1, dtype=torch.int64)}, [2]))[keys.SCALE]
+    used = policy.action_half_range
+    expected = torch.tensor([0.04, 0.04, 0.125 * used[2], 0.0025, 0.0025, 0.125 * used[5], 0.15])
+    assert torch.allclose(scale, expected.expand_as(scale)) and 0.018 < expected[5] < 0.021
+    # An update that moves every mean by as much of its range moves none of them by a multiple of the others' scale.
+    assert (used / expected).max() / (used / expected)[:3].min() < 3
