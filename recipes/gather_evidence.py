@@ -16,7 +16,7 @@ from run_folder import RunFolder
 from two_worlds import TwoWorlds, first_success, honesty_of, imagine, judged, live, relive
 from worldenv_trl import keys
 from worldenv_trl.data import episodes_from_rollouts
-from worldenv_trl.metrics import honesty, moving_pixel_psnr
+from worldenv_trl.metrics import advantage_correlation, honesty, moving_pixel_psnr
 from worldenv_trl.policies import laplace_actor
 from worldenv_trl.record import read_rollouts
 from worldenv_trl.reflectors import CompactReflector
@@ -186,9 +186,14 @@ def _relived(config: WorldEnvConfig, path: Path) -> list[dict[str, Any]]:
     stop = torch.where(stopped, episodes["length"].squeeze(-1), -1)
     reached = first_success(relive(config, episodes))
     imagined, real = judged(stop, reached)
+    returns = rollouts["returns"][..., 0, 0].flatten()
     rows = []
     for task, chosen in _by_task(episodes, config):
         figures = honesty(imagined[chosen], real[chosen], imagined_steps=stop[chosen], real_steps=reached[chosen])
+        groups = (-1, config.post_train.group_size)  # a group's rollouts follow each other and are of one task
+        figures["signal"], figures["mixed"] = advantage_correlation(
+            returns[chosen].reshape(groups), real[chosen].reshape(groups)
+        )
         rows.append({"iteration": int(path.stem.rsplit("_", 1)[1]), "task": task} | figures)
     return rows
 

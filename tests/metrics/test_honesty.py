@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from worldenv_trl.metrics import honesty, rank_correlation
+from worldenv_trl.metrics import advantage_correlation, honesty, rank_correlation
 
 IMAGINED = torch.tensor([True, True, True, False, False, True, False, True])
 REAL = torch.tensor([True, False, True, True, False, True, False, False])
@@ -74,3 +74,17 @@ def test_videos_add_drift():
     videos = torch.randint(0, 256, (8, 3, 3, 16, 16), dtype=torch.uint8)
     report = honesty(IMAGINED, REAL, imagined_frames=videos, real_frames=videos)
     assert report["drift"]["psnr"].tolist() == [60, 60]
+
+
+def test_advantages_are_compared_within_groups_only():
+    real = torch.tensor([[1, 1, 0, 0], [1, 0, 0, 1], [1, 1, 1, 1], [0, 1, 0, 1]], dtype=torch.bool)
+    returns = torch.tensor([[0.9, 0.7, 0.2, 0.3], [0.1, 0.4, 0.3, 0.2], [0.9, 0.1, 0.5, 0.2], [0.5, 0.5, 0.5, 0.5]])
+    expected = [np.corrcoef(returns[g], real[g].float())[0, 1] for g in (0, 1)] + [0.0]  # nothing is learned in group 3
+    assert advantage_correlation(returns, real) == (pytest.approx(np.mean(expected)), 3)
+    # A return that only tells contexts apart says nothing, however well it correlates over all rollouts.
+    easy = real.float().mean(1, keepdim=True).expand(4, 4)
+    assert np.corrcoef(easy.flatten(), real.flatten().float())[0, 1] > 0.4
+    assert advantage_correlation(easy, real) == (0, 3)
+    assert math.isnan(advantage_correlation(returns[2:3], real[2:3])[0])
+    with pytest.raises(ValueError, match=r"must both be \[G, N\], got \[4, 4\] and \[16\]"):
+        advantage_correlation(returns, real.flatten())

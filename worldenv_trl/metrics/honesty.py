@@ -11,7 +11,7 @@ from worldenv_trl.metrics.classification import classification
 from worldenv_trl.metrics.drift import drift
 from worldenv_trl.metrics.success import paired_test
 
-__all__ = ["honesty", "rank_correlation"]
+__all__ = ["advantage_correlation", "honesty", "rank_correlation"]
 
 
 def honesty(
@@ -73,6 +73,32 @@ def honesty(
     if imagined_frames is not None and real_frames is not None:
         report["drift"] = drift(imagined_frames, real_frames, length)
     return report
+
+
+def advantage_correlation(returns: Any, real: Any) -> tuple[float, int]:
+    """How much of what a group learns from is so: the correlation, within groups, of imagined returns and real success.
+
+    A leave-one-out advantage compares the rollouts of one context with each other; the difference between contexts,
+    which makes precision and recall look good, is no part of it.
+
+    Args:
+        returns: ``[G, N]`` of N imagined rollouts of each of G contexts.
+        real: bool ``[G, N]``, whether the physics reaches the goal under the same actions.
+
+    Returns:
+        The mean of Pearson's correlation over the groups in which some rollouts succeed and some fail, 0 where all
+        returns are equal, and the number of these groups; NaN if there is none.
+
+    Raises:
+        ValueError: if they are not both [G, N].
+    """
+    returns, real = torch.as_tensor(returns).double(), torch.as_tensor(real).double()
+    if returns.shape != real.shape or returns.ndim != 2:
+        raise ValueError(f"returns and real must both be [G, N], got {list(returns.shape)} and {list(real.shape)}")
+    x, y = returns - returns.mean(1, keepdim=True), real - real.mean(1, keepdim=True)
+    mixed = y.square().sum(1) > 0
+    scale = (x.square().sum(1) * y.square().sum(1)).sqrt().clamp_min(1e-12)
+    return ((x * y).sum(1) / scale)[mixed].mean().item(), int(mixed.sum())
 
 
 def rank_correlation(first: Any, second: Any) -> float:

@@ -134,7 +134,9 @@ def honesty(record: RunRecord, evidence: Evidence | None) -> str:
         parts += [
             "<h3>What LOOP learned from: its imagined rollouts, executed in the physics</h3>",
             '<p class="say">The harder test: these actions were rewarded in imagination. A gap that grows from the '
-            "first to the last iteration is a policy that learns the world model’s errors.</p>",
+            "first to the last iteration is a policy that learns the world model’s errors. Signal is the correlation "
+            "of imagined return and real success among the rollouts of one context, which is all that an advantage "
+            "sees (mean over the contexts with both outcomes, their number in brackets).</p>",
             _honesty_table("iteration", evidence.waves),
         ]
     for stage in record.stages("post_train"):
@@ -244,11 +246,19 @@ def _rated(line: dict[str, Any]) -> str:
 
 def _honesty_table(first: str, rows: Sequence[dict[str, Any]]) -> str:
     """Figures of :func:`~worldenv_trl.metrics.honesty` by ``first`` and task."""
-    figures = ("imagined, %", "real, %", "gap, points", "precision", "recall", "F1", "stop error")
+    figures = ["imagined, %", "real, %", "gap, points", "precision", "recall", "F1", "stop error"]
+    figures += ["signal"] if rows and "signal" in rows[0] else []
     cells = [
-        (escape(str(row[first])), escape(task_name(row["task"])), *_honest_cells(row), _steps(row)) for row in rows
+        (escape(str(row[first])), escape(task_name(row["task"])), *_honest_cells(row), _steps(row), *_signal(row))
+        for row in rows
     ]
     return table((first, "task", "n", *figures), cells, words=2)
+
+
+def _signal(row: dict[str, Any]) -> list[str]:
+    if "signal" not in row:
+        return []
+    return [f"{row['signal']:.2f} <small>({row['mixed']})</small>".replace("-", "−") if row["mixed"] else "–"]
 
 
 def _honest_cells(row: dict[str, Any]) -> tuple[Any, ...]:
