@@ -190,7 +190,7 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
         ),
     ),
     "improve": (
-        "The scale that raises held-out success; at most 60 minutes on 2 cores.",
+        "The scale meant to raise held-out success (README: how far it does); at most 60 minutes on 2 cores.",
         WorldEnvConfig(
             run_dir=Path("runs/improve"),
             train_states=150,

@@ -186,7 +186,7 @@ def _relived(config: WorldEnvConfig, path: Path) -> list[dict[str, Any]]:
     stop = torch.where(stopped, episodes["length"].squeeze(-1), -1)
     reached = first_success(relive(config, episodes))
     imagined, real = judged(stop, reached)
-    returns = rollouts["returns"][..., 0, 0].flatten()
+    returns = rollouts["returns"][..., 0].flatten()  # [G, N, T] holds the same at every decision
     rows = []
     for task, chosen in _by_task(episodes, config):
         figures = honesty(imagined[chosen], real[chosen], imagined_steps=stop[chosen], real_steps=reached[chosen])

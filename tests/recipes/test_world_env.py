@@ -98,7 +98,10 @@ def test_the_whole_loop_runs_writes_its_files_and_continues_where_it_stopped(tin
     steps = wave["next", keys.STEP_MASK]
     assert wave[keys.RATIO][steps].gt(0).all() and wave[keys.CLIPPED].dtype == torch.bool
     assert wave[keys.CHUNK].shape[-2:] == (8, 7)
-    assert "physics" in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert "physics" in told.out and "missing in the report" not in told.out
+    assert "the report could not be written" not in told.err
+    assert "Signal is the correlation" in (tiny.run_dir / "report.html").read_text()
 
     (tiny.run_dir / "stages" / "evaluate").unlink()
     before = folder.checkpoint("post_train").joinpath("model.safetensors").stat().st_mtime_ns
