@@ -164,8 +164,8 @@ class ScriptedExpert:
         far, (x, y) = 100 * out_of_reach(goal)[0], goal[0, :2] - setting_of(self.task.problem).origin
         warnings.warn(
             f"{self.task.name}: the expert fails at ({' '.join(self._stages[stage].aim)}) in row {rows[0]}: the hand "
-            f"would have to be at x = {x:.2f}, y = {y:.2f} of the workspace, {far:.0f} cm out of the arm's reach; move "
-            "the thing, or where it belongs, in the task file",
+            f"would have to be at x = {x:.2f}, y = {y:.2f} of the workspace, {far:.0f} cm out of the arm's reach; "
+            "if it was not pushed there, move the thing, or where it belongs, in the task file",
             stacklevel=2,
         )
 
