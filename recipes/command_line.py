@@ -15,7 +15,7 @@ _OPTIONS = (
     ("pass overwrite=True", "pass --overwrite"),
     ("or pass replays=True to read them", "name them one by one"),
     ("pass replays=True to read them", "name them one by one"),
-    ("pass a policy, or an edit", "pass --policy, or an --edit"),
+    ("pass a policy, or no seed", "pass --policy, or no --seed"),
     ("pass its world_model", "pass --world-model"),
     ("pass a reflector, too", "pass --reflector, too"),
     ("or another target", "or another --target"),

@@ -26,17 +26,22 @@ def make_rollouts(rows: int = 4, steps: int = 10, size: int = 32) -> TensorDict:
 
 
 class NoiseEnv(EnvBase):
-    """Rows that show noise."""
+    """Rows that show noise, after the first reset nothing yet if ``dark``."""
 
-    def __init__(self, rows: int) -> None:
+    def __init__(self, rows: int, dark: bool = False) -> None:
         super().__init__(batch_size=[rows])
+        self.dark = dark
         shape = (rows, 3, 32, 32)
         image = Bounded(0, 255, shape, dtype=torch.uint8, domain="discrete")
         self.observation_spec = Composite({"observation": Composite(image=image, shape=[rows])}, shape=[rows])
         self.action_spec, self.reward_spec = Unbounded([rows, 7]), Unbounded([rows, 1])
 
     def _reset(self, tensordict=None):
-        return TensorDict({"observation": self.observation_spec["observation"].rand()}, self.batch_size)
+        shown = self.observation_spec["observation"].rand()
+        if self.dark:
+            shown["image"].zero_()
+            self.dark = False
+        return TensorDict({"observation": shown}, self.batch_size)
 
     def _step(self, tensordict):
         flags = {name: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for name in ("done", "terminated")}

@@ -21,6 +21,7 @@ from worldenv_trl.record import (
     recorded,
     repair,
 )
+from worldenv_trl.record.mcap_file import McapFile
 from worldenv_trl.record.scan import McapScan
 
 ENTRIES = (keys.IMAGE, keys.ACTION, ("next", *keys.IMAGE), ("next", "reward"))
@@ -166,3 +167,38 @@ def test_a_rollout_keeps_its_number_when_one_before_it_is_lost(tmp_path):
         assert torch.equal(read[0]["next", *keys.IMAGE], rollouts[number]["next", *keys.IMAGE])
     with pytest.raises(ValueError, match=r"holds no rollouts that were asked for: .* is damaged behind byte"):
         read_rollouts(path, rollouts=2)
+
+
+def test_a_recorder_s_file_that_was_filtered_is_refused(tmp_path):
+    path = tmp_path / "a.mcap"
+    streamed(path)
+    scan = McapScan(path)
+    for number, dropped in enumerate((lambda n, t: n == 1, lambda n, t: n == 3 and t == "/step")):
+        file, kept = McapFile(tmp_path / f"filtered_{number}.mcap"), 0
+        for record in scan.metadata:
+            file.write_metadata(record.name, record.metadata)
+        for chunk in scan.chunks:
+            for place, (channel, rollout, time, data) in enumerate(scan.messages(chunk)):
+                topic = scan.channels[channel].topic
+                if dropped(rollout, topic) and place % 2:
+                    continue
+                schema = scan.schemas[scan.channels[channel].schema_id]
+                file.add(file.channel(topic, schema.name, schema.data), time, bytes(data), rollout)
+                kept += 1
+        file.close()
+        assert kept
+        with pytest.raises(ValueError, match=r"of 30 steps were found\. It was filtered or edited; read the original"):
+            read_rollouts(tmp_path / f"filtered_{number}.mcap")
+
+
+def test_a_repair_never_writes_over_the_damaged_file(tmp_path):
+    path = tmp_path / "a.mcap"
+    written(path)
+    partial = tmp_path / "b.partial.mcap"
+    partial.write_bytes(path.read_bytes()[:-500])
+    before = partial.read_bytes()
+    for overwrite in (False, True):
+        with pytest.raises(ValueError, match=r"b\.mcap is written it has the name of the damaged file"):
+            repair(partial, tmp_path / "b.mcap", overwrite=overwrite)
+    assert partial.read_bytes() == before and not (tmp_path / "b.mcap").exists()
+    assert repair(partial).target.name == "b.repaired.mcap"

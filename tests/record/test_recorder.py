@@ -9,6 +9,7 @@ import warnings
 import pytest
 import torch
 from mcap.reader import make_reader
+from recordings import NoiseEnv
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv
@@ -120,6 +121,16 @@ def test_predicted_states_action_maps_and_annotations_are_added(tmp_path):
 def test_options_of_another_kind_are_refused_at_once(tmp_path, options, error, message):
     with pytest.raises(error, match=message):
         Recorder(tmp_path / "a.mcap", **options)
+
+
+def test_a_black_first_image_does_not_blacken_the_later_ones(tmp_path):
+    env = recorded(NoiseEnv(2, dark=True), tmp_path / "a.mcap")
+    rollouts = torch.cat([env.rollout(4) for _ in range(2)])
+    env.close()
+    assert not rollouts[keys.IMAGE][:2, 0].any() and rollouts[keys.IMAGE][2:, 0].any()
+    read = read_rollouts(tmp_path / "a.mcap")
+    assert torch.equal(read[keys.IMAGE], rollouts[keys.IMAGE])
+    assert torch.equal(read["next", *keys.IMAGE], rollouts["next", *keys.IMAGE])
 
 
 def test_what_is_excluded_must_be_there_and_may_be_a_nest(tmp_path):

@@ -177,6 +177,7 @@ def test_the_reflector_stops_where_it_did_and_another_threshold_stops_elsewhere(
     assert end.step == 9 and "the recording ends at step 13, the replay at step 9" in str(hasty)
     lower = replay(tmp_path / "a.mcap", 0, world_model=model, reflector=judge, threshold=0.5, write=False)
     assert lower.kind == "what-if" and lower.outcome["replayed"]["last step"] == 9
+    assert "without the change it ends at step 13, with it at step 9" in str(lower) and "no effect" not in str(lower)
     # Before the branch nothing stops it, although frames cross the new threshold there.
     late = replay(tmp_path / "a.mcap", 0, world_model=model, reflector=judge, threshold=0.3, from_step=8, write=False)
     assert late.outcome["replayed"]["last step"] == 9

@@ -303,3 +303,37 @@ def test_physical_states_of_several_tasks_are_padded_to_the_longest(tmp_path):
     read = read_rollouts(tmp_path / "a.mcap")["sim_state"]
     assert read.shape == (4, 4, 5)
     assert read.sum((1, 2)).tolist() == [12, 12, 20, 20] and not read[:2, :, 3:].any()
+
+
+def test_an_image_that_was_a_number_before_the_step_comes_back_as_both(tmp_path):
+    rollouts = TensorDict(
+        {
+            "observation": {"view": torch.rand(2, 3, 3, 16, 16)},
+            "next": {"observation": {"view": torch.randint(0, 256, (2, 3, 3, 16, 16), dtype=torch.uint8)}},
+        },
+        [2, 3],
+    )
+    write(tmp_path / "a.mcap", rollouts)
+    read = read_rollouts(tmp_path / "a.mcap")
+    assert torch.equal(read["observation", "view"], rollouts["observation", "view"])
+    assert torch.equal(read["next", "observation", "view"], rollouts["next", "observation", "view"])
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"depth": torch.zeros(2, 3, 8, dtype=torch.uint16)}, r"entry \('depth',\) is torch.uint16.*int32"),
+        ({"text": torch.zeros(2, 3, 1)}, r"entry \('text',\) has a name that recordings use themselves"),
+        ({"step": torch.zeros(2, 3, 3, 16, 16, dtype=torch.uint8)}, r"would be on the topic /step of a recording"),
+        (
+            {name: torch.zeros(2, 3, 3, 16, 16, dtype=torch.uint8) for name in ("a/b", ("a", "b"))},
+            "would both be the image topic /a/b: rename one",
+        ),
+    ],
+)
+def test_entries_that_could_not_be_read_back_are_refused(tmp_path, entries, message):
+    rollouts = TensorDict({}, [2, 3])
+    for key, value in entries.items():
+        rollouts.set(key, value)
+    with pytest.raises(ValueError, match=message):
+        write(tmp_path / "a.mcap", rollouts)

@@ -16,6 +16,7 @@ from worldenv_trl.record.protobuf import FixedMessage, MessageField
 
 __all__ = ["Entry", "Layout", "executed_entries", "from_bytes", "leaves", "to_bytes"]
 
+_TOPICS = ("step", "reset", "hand", "instruction")  # that are no images
 _INDEX_FIELDS = [MessageField("rollout", torch.int64, 1), MessageField("step", torch.int64, 1)]
 
 
@@ -66,6 +67,7 @@ class Layout:
     def of(cls, flat: dict[tuple[str, ...], Tensor], texts: Iterable[tuple[str, ...]], valid: Tensor) -> Layout:
         """The layout that keeps tensors [R, T, ...] by path without loss where ``valid`` bool [R, T]."""
         flat = {key: value for key, value in flat.items() if key != MASK}
+        _check_storable(flat)
         count = valid.shape[0]
         images: list[Entry] = []
         numbers: list[Entry] = []
@@ -83,7 +85,9 @@ class Layout:
                     # The root value may have another dtype or shape than the next one.
                     kind = str(root.dtype).removeprefix("torch.")
                     kept = [Entry(below, "root", kind, tuple(root.shape[2:])), entry]
-            (images if _is_image(value) else numbers).extend(kept)
+            for each in kept:
+                own = root if each.stored == "root" and root is not None else value
+                (images if _is_image(own) else numbers).append(each)
         images = _name_images(images, flat, valid) if count else images
         decisions = [e.shape[0] for e in images if len(e.shape) == 4]
         return cls(tuple(images), _name_fields(numbers), tuple(sorted(texts)), max(decisions, default=1))
@@ -126,6 +130,8 @@ def leaves(rollouts: TensorDictBase) -> tuple[dict[tuple[str, ...], Tensor], dic
     def walk(part: TensorDictBase, above: tuple[str, ...]) -> None:
         for name in part.keys():  # noqa: SIM118 - a TensorDict iterates over rows
             value, path = part.get(name), (*above, name)
+            if path == ("text",) and isinstance(value, Tensor):
+                raise ValueError(f"entry {path} has a name that recordings use themselves: call it something else")
             if isinstance(value, str):
                 texts[path] = value
             elif is_non_tensor(value):
@@ -176,6 +182,22 @@ def from_bytes(raw: np.ndarray, entry: Entry) -> Tensor:
     return values.reshape(len(raw), *entry.shape)
 
 
+def _check_storable(flat: dict[tuple[str, ...], Tensor]) -> None:
+    """Raises ``ValueError`` for entries that could not be read back."""
+    topics: dict[str, tuple[str, ...]] = {}
+    for key, value in flat.items():
+        if value.dtype in (torch.uint16, torch.uint32, torch.uint64):
+            raise ValueError(f"entry {key} is {value.dtype}, which torch can hardly index: record it as int32 or int64")
+        below = key[1:] if key[0] == "next" else key
+        name = "/".join(below)
+        if not _is_image(value):
+            continue
+        if topics.setdefault(name, below) != below:
+            raise ValueError(f"entries {topics[name]} and {below} would both be the image topic /{name}: rename one")
+        if name in _TOPICS:
+            raise ValueError(f"the image {key} would be on the topic /{name} of a recording: call it something else")
+
+
 def _replace(entry: Entry, **changes) -> Entry:
     return Entry(**asdict(entry) | changes)
 
@@ -209,7 +231,8 @@ def _name_images(images: list[Entry], flat: dict[tuple[str, ...], Tensor], valid
         topic = "/" + "/".join(entry.key)
         if entry.stored == "root" and any(e.key == entry.key and e.stored == "next" for e in images):
             topic = "/root" + topic
-        if entry.stored == "chained" and not bool(flat[entry.key][:, 0].any()):
+        # Before the first decision there are no frames; any other first image may be black by chance.
+        if entry.stored == "chained" and entry.key == frames_key and not bool(flat[entry.key][:, 0].any()):
             entry = _replace(entry, stored="chained_from_zero")
         if joined and entry.key == image_key:
             entry = _replace(entry, stored="last_of_frames")

@@ -52,7 +52,7 @@ def read_rollouts(
 
     Keyword Args:
         task: only rollouts of this task.
-        rollouts: only these, counted through all files.
+        rollouts: only these, counted through all files; they come in the order of the files, each once.
         time: only rollouts that play between these seconds of their file, as a viewer's time line shows them.
         steps: only this part of each rollout.
         keys: only these entries, named as in the TensorDict; the others are not decoded.

@@ -166,6 +166,7 @@ class Recording:
         streamed = [part for layout, prefix in self.streams for part in self._streamed(layout, prefix, found)]
         if keep is not None:
             streamed = [part.select(self._kept(part, keep)) for part in streamed]
+        self._check_announced(streamed, keep is None)
         parts = [part for part in (*written, *streamed) if part.rows]
         self.damaged = set()
         if self.streams and keep is None:  # where a recorder was not closed, how many there were is not known
@@ -178,6 +179,18 @@ class Recording:
             self._annotate(part, found, wanted)
             self.damaged |= set(part.damaged)
         return [part for part in parts if part.rows]
+
+    def _check_announced(self, streamed: list[Part], everything: bool) -> None:
+        """Raises ``ValueError`` if a whole file lacks steps that its recorder says it has written."""
+        if not self._lengths or not self.scan.intact or self.repaired:
+            return
+        have = {n: length for part in streamed for n, length in zip(part.numbers, part.lengths, strict=True)}
+        said = {n: self._lengths[n] for n in (range(len(self._lengths)) if everything else have)}
+        if have != said:
+            raise ValueError(
+                f"{self.path} lacks messages: {len(have)} of {len(said)} rollouts and {sum(have.values())} of "
+                f"{sum(said.values())} steps were found. It was filtered or edited; read the original"
+            )
 
     @staticmethod
     def _kept(part: Part, keep: Callable[[int, int, int], bool]) -> list[int]:

@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from worldenv_trl.record.mcap_file import REPAIRED_SUFFIX, McapFile
+from worldenv_trl.record.mcap_file import PARTIAL_SUFFIX, REPAIRED_SUFFIX, McapFile
 from worldenv_trl.record.recording import Recording
 from worldenv_trl.record.writer import FORMAT
 
@@ -49,6 +49,8 @@ def repair(path: str | os.PathLike, target: str | os.PathLike | None = None, *, 
     target = path.with_name(f"{name}{REPAIRED_SUFFIX}") if target is None else Path(target)
     if target.resolve() == path.resolve():
         raise ValueError(f"the repaired file must have another name than {path}: the damaged one is kept")
+    if target.with_name(target.stem + PARTIAL_SUFFIX).resolve() == path.resolve():
+        raise ValueError(f"while {target} is written it has the name of the damaged file, {path}: choose another name")
     opened = [list(scan.messages(chunk)) for chunk in scan.chunks]
     count = sum(map(len, opened))
     if scan.intact:

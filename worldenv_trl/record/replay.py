@@ -117,10 +117,13 @@ def replay(
     against = recorded if unchanged is None else observed(unchanged)
     divergences, compared = compare(against, shown, after=branch.step if branch else -1, state_parts=parts)
     end = max(int(steps.max()) for steps, _ in shown.values())
+    before = source.steps if unchanged is None else max(int(steps.max()) for steps, _ in against.values())
     # Without its reflector an imagined rollout plays its last chunk to the end.
-    if branch is None and (end < source.steps or (end > source.steps and reflector is not None)):
-        words = f"the recording ends at step {source.steps}, the replay at step {end}"
-        divergences.append(Divergence(min(end, source.steps), "end", abs(end - source.steps), words))
+    if end < before or (end > before and (branch is not None or reflector is not None)):
+        words = f"the recording ends at step {before}, the replay at step {end}"
+        if unchanged is not None:
+            words = f"without the change it ends at step {before}, with it at step {end}"
+        divergences.append(Divergence(min(end, before), "end", abs(end - before), words))
         divergences.sort(key=lambda each: each.step)
     report = ReplayReport(
         source=source.path,
@@ -158,7 +161,7 @@ def _branch(source, mode, world_model, reflector, from_step, policy, seed, thres
     if threshold is not None and not 0 < threshold < 1:
         raise ValueError(f"threshold must be in (0, 1), got {threshold}")
     if seed is not None and policy is None and mode == "physics":
-        raise ValueError("a seed changes nothing in the physics without a policy: pass a policy, or an edit")
+        raise ValueError("a seed changes nothing in the physics without a policy: pass a policy, or no seed")
     check_edits(edits)
     if edits and policy is None and max(edits) >= source.steps:
         raise ValueError(f"the recorded actions end at step {source.steps - 1}, an edit names {max(edits)}")

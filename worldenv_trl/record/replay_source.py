@@ -96,6 +96,8 @@ def open_rollout(path: str | os.PathLike, rollout: int) -> Source:
     """
     if Path(path).is_dir():
         raise ValueError(f"{path} is a folder: name one recording to replay")
+    if isinstance(rollout, bool) or not isinstance(rollout, int):
+        raise TypeError(f"rollout must be a number, got {rollout!r}")
     entries = read_rollouts(path, rollouts=rollout)[0]
     entries = entries[entries[MASK]]
     have = set(entries.keys(True, True))

@@ -228,6 +228,9 @@ class RolloutStream:
             ]
             self._entry_bytes = sum(entry.nbytes for entry in entries)
         self._check(values)
+        for entry in self._layout.images:
+            if entry.stored == "chained_from_zero" and entry.key in begun and bool(begun[entry.key].any()):
+                raise ValueError(f"entry {entry.key} was zero when the first rollout began, it must be so in all")
         for number in numbers:
             if number == len(self._starts):
                 self._starts.append(self._time)
