@@ -82,3 +82,26 @@ def test_an_existing_log_is_kept_unless_asked(tmp_path):
     with pytest.raises(FileExistsError, match="overwrite=True"):
         MCAPLogger("run", tmp_path)
     MCAPLogger("run", tmp_path, overwrite=True).shutdown()
+
+
+def test_a_second_logger_on_one_path_is_refused_while_the_first_writes(tmp_path):
+    logger = MCAPLogger("a", tmp_path)
+    logger.log_scalar("x", 1.0)
+    with pytest.raises(FileExistsError, match="is being written by another logger"):
+        MCAPLogger("a", tmp_path, overwrite=True)
+    logger.shutdown()
+    MCAPLogger("a", tmp_path, overwrite=True).shutdown()
+
+
+def test_what_cannot_be_logged_is_refused(tmp_path):
+    logger = MCAPLogger("a", tmp_path)
+    logger.log_scalar("x", 1.0)
+    with pytest.raises(ValueError, match="'x' was logged as a scalar, it cannot be a histogram, too"):
+        logger.log_histogram("x", [1.0, 2.0])
+    with pytest.raises(ValueError, match="fps must be positive, got 0"):
+        logger.log_video("v", torch.zeros(2, 3, 8, 8, dtype=torch.uint8), fps=0)
+    with pytest.raises(TypeError, match="must be text, got None"):
+        logger.log_scalar(None, 1.0)
+    logger.shutdown()
+    with pytest.raises(ValueError, match=r"a\.mcap is closed: 'y' was not logged"):
+        logger.log_scalar("y", 1.0)

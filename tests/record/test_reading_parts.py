@@ -128,6 +128,7 @@ def test_an_unknown_entry_is_named_with_those_that_are_close(tmp_path):
         ({"keys": [("next", 3)]}, TypeError, "keys must be a list of entries"),
         ({"rollouts": "0"}, TypeError, "rollouts must be a number, a slice or a list of numbers, got '0'"),
         ({"rollouts": [True]}, TypeError, r"a list of numbers, got \[True\]"),
+        ({"time": {4, 8}}, TypeError, "time must be two numbers"),
         ({"time": 5}, TypeError, "time must be two numbers, the first and the last second, got 5"),
         ({"time": (5, 1)}, ValueError, r"in this order, got \(5, 1\)"),
         ({"steps": 3}, TypeError, r"steps must be a slice, such as slice\(0, 10\), got 3"),

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import json
 import os
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,9 @@ class MCAPLogger(Logger):
         overwrite: replace an existing file.
 
     Raises:
-        FileExistsError: if the file exists and ``overwrite`` is False.
+        FileExistsError: if the file exists and ``overwrite`` is False, or another logger is writing it.
+        ValueError: from any method after :meth:`shutdown`, and for a name that already is of another kind.
+        OSError: from :meth:`shutdown`, if the file could not be completed.
 
     Examples:
         >>> logger = MCAPLogger("post_train", "runs/demo")
@@ -59,7 +62,9 @@ class MCAPLogger(Logger):
         self.path = Path(log_dir) / f"{exp_name}.mcap"
         if self.path.exists() and not overwrite:
             raise FileExistsError(f"{self.path} exists: pass overwrite=True or choose another exp_name")
-        self._channels: dict[str, Any] = {}
+        _require_idle(self.path)
+        self._channels: dict[str, tuple[str, Any]] = {}  # kind and channel, by topic
+        self._closed = False
         self._timer: threading.Timer | None = None
         super().__init__(exp_name=exp_name, log_dir=str(log_dir))
 
@@ -67,16 +72,34 @@ class MCAPLogger(Logger):
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._context = Context()
         options = MCAPWriteOptions(compression_threads=0)
-        return foxglove.open_mcap(self.path, allow_overwrite=True, context=self._context, writer_options=options)
+        writer = foxglove.open_mcap(self.path, allow_overwrite=True, context=self._context, writer_options=options)
+        self._lock = open(self.path, "rb")  # noqa: SIM115 - as long as the logger writes
+        fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return writer
+
+    def _channel(self, name: str, kind: str, make: Callable[[str], Any]) -> Any:
+        """The channel of a name, made at the first call."""
+        if self._closed:
+            raise ValueError(f"the logger of {self.path} is closed: {name!r} was not logged")
+        if not isinstance(name, str):
+            raise TypeError(f"the name of what is logged must be text, got {name!r}")
+        topic = "/" + name.strip("/")
+        known, channel = self._channels.get(topic, (kind, None))
+        if known != kind:
+            raise ValueError(f"{name!r} was logged as a {known}, it cannot be a {kind}, too: choose another name")
+        if channel is None:
+            channel = make(topic)
+            self._channels[topic] = kind, channel
+        return channel
 
     def log_scalar(self, name: str, value: float, step: int | None = None) -> None:
         numbers = np.array([[float(value)]]).view(np.uint8), np.array([[_NO_STEP if step is None else step]])
         message = _SCALAR.pack([numbers[0], numbers[1].astype(np.int64).view(np.uint8)])[0]
-        topic = _topic(name)
-        if topic not in self._channels:
-            schema = Schema(name=_SCALAR.name, encoding="protobuf", data=_SCALAR.schema())
-            self._channels[topic] = Channel(topic, schema=schema, message_encoding="protobuf", context=self._context)
-        self._channels[topic].log(message, log_time=time.time_ns())
+        schema = Schema(name=_SCALAR.name, encoding="protobuf", data=_SCALAR.schema())
+        channel = self._channel(
+            name, "scalar", lambda t: Channel(t, schema=schema, message_encoding="protobuf", context=self._context)
+        )
+        channel.log(message, log_time=time.time_ns())
         self._flush_soon()
 
     def _flush_soon(self) -> None:
@@ -91,7 +114,13 @@ class MCAPLogger(Logger):
         if self._timer is not None:
             self._timer.cancel()
             self._timer.join()
-        super().shutdown(timeout)
+        self._closed = True
+        try:
+            super().shutdown(timeout)
+        except RuntimeError as error:
+            raise OSError(f"{self.path} could not be completed ({error}): is the disk full?") from error
+        finally:
+            self._lock.close()
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, *, fps: float = 20.0, **_: Any) -> None:
         """Frames uint8 [T, 3, H, W], or several videos [N, T, 3, H, W], one after another; 20 a second by default.
@@ -101,9 +130,9 @@ class MCAPLogger(Logger):
         """
         if video.dtype != torch.uint8 or video.ndim not in (4, 5) or video.shape[-3] != 3:
             raise ValueError(f"video must be uint8 [(N,) T, 3, H, W], got {video.dtype} {tuple(video.shape)}")
-        topic = _topic(name)
-        if topic not in self._channels:
-            self._channels[topic] = RawImageChannel(topic, context=self._context)
+        if not fps > 0:
+            raise ValueError(f"fps must be positive, got {fps}")
+        channel = self._channel(name, "video", lambda t: RawImageChannel(t, context=self._context))
         frames = video.reshape(-1, *video.shape[-3:]).permute(0, 2, 3, 1).contiguous().cpu().numpy()
         now = time.time_ns()
         for place, frame in enumerate(frames):
@@ -117,7 +146,7 @@ class MCAPLogger(Logger):
                 step=3 * frame.shape[1],
                 data=frame.tobytes(),
             )
-            self._channels[topic].log(message, log_time=at)
+            channel.log(message, log_time=at)
         self._flush_soon()
 
     def log_hparams(self, cfg: Any) -> None:
@@ -134,21 +163,20 @@ class MCAPLogger(Logger):
         """A histogram as JSON on ``/<name>``: ``counts`` [bins], ``edges`` [bins + 1], ``step``."""
         values = np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data, dtype=np.float64).ravel()
         counts, edges = np.histogram(values, bins=bins)
-        topic = _topic(name)
-        if topic not in self._channels:
-            self._channels[topic] = Channel(topic, message_encoding="json", schema=_HISTOGRAM, context=self._context)
+        channel = self._channel(
+            name, "histogram", lambda t: Channel(t, message_encoding="json", schema=_HISTOGRAM, context=self._context)
+        )
         message = {"counts": counts.tolist(), "edges": edges.tolist(), "step": _NO_STEP if step is None else step}
-        self._channels[topic].log(json.dumps(message).encode(), log_time=time.time_ns())
+        channel.log(json.dumps(message).encode(), log_time=time.time_ns())
         self._flush_soon()
 
     def log_str(self, name: str, value: str, step: int | None = None) -> None:
         """A line of text on the ``/log`` topic."""
-        if "/log" not in self._channels:
-            self._channels["/log"] = LogChannel("/log", context=self._context)
+        channel = self._channel("log", "text", lambda topic: LogChannel(topic, context=self._context))
         now = time.time_ns()
         text = value if step is None else f"step {step}: {value}"
         stamp = Timestamp(*divmod(now, 1_000_000_000))
-        self._channels["/log"].log(Log(timestamp=stamp, level=LogLevel.Info, message=text, name=name), log_time=now)
+        channel.log(Log(timestamp=stamp, level=LogLevel.Info, message=text, name=name), log_time=now)
         self._flush_soon()
 
     def __repr__(self) -> str:
@@ -166,5 +194,12 @@ _HISTOGRAM = {
 }
 
 
-def _topic(name: str) -> str:
-    return "/" + name.strip("/")
+def _require_idle(path: Path) -> None:
+    """Raises ``FileExistsError`` if another logger is writing the file."""
+    if not path.exists():
+        return
+    with open(path, "rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise FileExistsError(f"{path} is being written by another logger: choose another exp_name") from error

@@ -25,7 +25,7 @@ def check_arguments(path, task=None, rollouts=None, time=None, steps=None, keys=
     if not whole and not (_is_list(rollouts) and all(map(_is_number, rollouts))):
         raise TypeError(f"rollouts must be {_ROLLOUTS}, got {rollouts!r}")
     if time is not None:
-        if not _is_list(time) or len(time) != 2 or not all(isinstance(each, Real) for each in time):
+        if not isinstance(time, tuple | list) or len(time) != 2 or not all(isinstance(each, Real) for each in time):
             raise TypeError(f"time must be {_TIME}, got {time!r}")
         if not time[0] <= time[1]:
             raise ValueError(f"time must be {_TIME}, in this order, got {time!r}")
