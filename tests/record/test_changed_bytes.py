@@ -23,6 +23,7 @@ from worldenv_trl.record import (
 )
 from worldenv_trl.record.mcap_file import McapFile
 from worldenv_trl.record.scan import McapScan
+from worldenv_trl.record.viewers import shown_rollouts
 
 ENTRIES = (keys.IMAGE, keys.ACTION, ("next", *keys.IMAGE), ("next", "reward"))
 
@@ -167,6 +168,9 @@ def test_a_rollout_keeps_its_number_when_one_before_it_is_lost(tmp_path):
         assert torch.equal(read[0]["next", *keys.IMAGE], rollouts[number]["next", *keys.IMAGE])
     with pytest.raises(ValueError, match=r"holds no rollouts that were asked for: .* is damaged behind byte"):
         read_rollouts(path, rollouts=2)
+    target = repair(path).target
+    assert [shown.number for shown in shown_rollouts(target)] == [0, 1, 3, 4, 5]
+    assert [shown.number for shown in shown_rollouts(target, slice(3))] == [0, 1, 3]
 
 
 def test_a_recorder_s_file_that_was_filtered_is_refused(tmp_path):

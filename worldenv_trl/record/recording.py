@@ -301,7 +301,13 @@ class Recording:
             return self._number
         if self._lengths:
             return len(self._lengths)
-        return 1 + max((n for part in self.parts(wanted=lambda _: False) for n in part.numbers), default=-1)
+        return 1 + max(self.numbers(), default=-1)
+
+    def numbers(self) -> list[int]:
+        """The numbers of the rollouts of which something is left."""
+        if not self.streams:
+            return list(range(self._number))
+        return sorted(n for part in self.parts(wanted=lambda _: False) for n in part.numbers)
 
     def expected(self, keep: Callable[[int, int, int], bool] | None = None) -> int:
         """How many entries the chosen rollouts had, as far as the file says."""

@@ -78,7 +78,7 @@ def shown_rollouts(path: str | os.PathLike, rollouts: Sequence[int] | slice = sl
         FileNotFoundError, ValueError: as :func:`~worldenv_trl.record.read_rollouts`.
     """
     recording = Recording(_file(path))
-    chosen = list(rollouts) if not isinstance(rollouts, slice) else range(recording.count())[rollouts]
+    chosen = recording.numbers()[rollouts] if isinstance(rollouts, slice) else list(rollouts)
     for number in chosen:
         entries = read_rollouts(path, rollouts=number)[0]
         entries = entries[entries[MASK]]
