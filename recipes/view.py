@@ -75,7 +75,9 @@ def _foxglove(options: Options) -> int:
     infos = {info.number: info for info in list_rollouts(options.file)} if options.rollout else {}
     for number in options.rollout:
         if number not in infos:
-            raise ValueError(f"{options.file} holds the rollouts 0 to {max(infos)}, not {number}")
+            raise ValueError(
+                f"{options.file} holds {f'the rollouts 0 to {max(infos)}, not' if infos else 'no rollout'} {number}"
+            )
     target = options.save or options.file.with_name(f"{options.file.stem}.foxglove.json")
     if target.exists() and not options.overwrite and target.read_text() != layout:
         raise FileExistsError(f"{target} exists: pass --overwrite or --save another name")

@@ -116,6 +116,7 @@ VIEW = [
     (("real.mcap", "--save", "new.mcap"), "--save must end in .rrd for rerun, got new.mcap"),
     (("real.mcap", "--viewer", "foxglove", "--save", "new.rrd"), "--save must end in .json for foxglove, got new.rrd"),
     (("real.mcap", "--viewer", "foxglove", "--save", "a.json", "--rollout", "2"), "holds the rollouts 0 to 1, not 2"),
+    (("bare.mcap", "--viewer", "foxglove", "--save", "a.json", "--rollout", "0"), "bare.mcap holds no rollout 0"),
 ]
 REPAIR = [
     *EVERYONE,
