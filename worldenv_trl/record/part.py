@@ -17,10 +17,18 @@ from worldenv_trl.record.layout import Entry, Layout, from_bytes
 from worldenv_trl.record.messages import image_head
 from worldenv_trl.record.protobuf import image_data
 
-__all__ = ["Found", "Part"]
+__all__ = ["Found", "Part", "lacks_messages"]
 
 Found = dict[str, list[tuple[int, memoryview]]]  # the messages of a rollout by topic: time (ns) and data
 _Path = tuple[str, ...]
+
+
+def lacks_messages(file: Path, rollouts: tuple[int, int], steps: tuple[int, int]) -> ValueError:
+    """The error for a whole file that holds fewer rollouts and steps than it announces: found, announced."""
+    return ValueError(
+        f"{file} lacks messages: {rollouts[0]} of {rollouts[1]} rollouts and {steps[0]} of {steps[1]} steps were "
+        "found. It was filtered or edited; read the original"
+    )
 
 
 @dataclass
@@ -79,10 +87,8 @@ class Part:
         resets = [messages.get(f"{self.prefix}/reset", []) for messages in rollouts]
         have = [len(each) for each in steps]
         if complete and (have != self.lengths or any(len(each) != 1 for each in resets)):
-            raise ValueError(
-                f"{self.file} lacks messages: {sum(map(bool, resets))} of {self.rows} rollouts and {sum(have)} of "
-                f"{sum(self.lengths)} steps were found. It was filtered or edited; read the original"
-            )
+            rollouts, found = (sum(map(bool, resets)), self.rows), (sum(have), sum(self.lengths))
+            raise lacks_messages(self.file, rollouts, found)
         if not complete:
             have = [self._leading(*each) for each in zip(steps, resets, self.starts, self.lengths, strict=True)]
         self._decode_numbers(resets, steps, have, wanted)

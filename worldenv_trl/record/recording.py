@@ -18,7 +18,7 @@ from worldenv_trl.keys import EPISODE, ROW
 from worldenv_trl.record.annotations import annotation_message
 from worldenv_trl.record.encoder import PERIOD_NS
 from worldenv_trl.record.layout import Entry, Layout, from_bytes
-from worldenv_trl.record.part import Found, Part
+from worldenv_trl.record.part import Found, Part, lacks_messages
 from worldenv_trl.record.scan import McapScan
 from worldenv_trl.record.writer import FORMAT, VERSION
 
@@ -187,10 +187,7 @@ class Recording:
         have = {n: length for part in streamed for n, length in zip(part.numbers, part.lengths, strict=True)}
         said = {n: self._lengths[n] for n in (range(len(self._lengths)) if everything else have)}
         if have != said:
-            raise ValueError(
-                f"{self.path} lacks messages: {len(have)} of {len(said)} rollouts and {sum(have.values())} of "
-                f"{sum(said.values())} steps were found. It was filtered or edited; read the original"
-            )
+            raise lacks_messages(self.path, (len(have), len(said)), (sum(have.values()), sum(said.values())))
 
     @staticmethod
     def _kept(part: Part, keep: Callable[[int, int, int], bool]) -> list[int]:
