@@ -110,8 +110,8 @@ def run(config: WorldEnvConfig, folder: RunFolder, source: str, target: str, mod
         if stuck == _PATIENCE:
             progress.write(_STUCK.format(target, iteration, stuck, settings.max_kl))
         if about:
-            decisions = wave.reshape(-1).split(settings.minibatch_size)
-            wave.update(torch.cat([loss.ratios(part) for part in decisions]).reshape(wave.shape))
+            parts = wave.reshape(-1).split(settings.minibatch_size)
+            wave.update(torch.cat([loss.ratios(part) for part in parts]).reshape(wave.shape))
         mean.update_parameters(policy)
         collector.update_policy_weights_()
 
