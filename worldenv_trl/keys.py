@@ -20,7 +20,7 @@ WRIST_IMAGE = ("observation", "wrist_image")  # uint8 [*B, 3, H, W]
 STATE = ("observation", "state")  # float32 [*B, 7]: position (m), axis-angle (rad), gripper opening in [0, 1]
 KINEMATIC_STATE = "kinematic_state"  # float32 [*B, 20]: q (7), x_des (3), R_des (9, row-major), gripper opening
 INSTRUCTION = "language_instruction"  # NonTensor str
-TASK_ID = "task_id"  # int64 [*B, 1], index into the task catalogue
+TASK_ID = "task_id"  # int64 [*B, 1], index into the instructions of the run at hand; no identity
 CONTEXT_ID = "context_id"  # int64 [*B, 1], the initial state a rollout started from
 SIM_STATE = "sim_state"  # float64 [*B, S], MuJoCo integration state
 NUM_STEPS = "num_steps"  # int64 [*B, 1], env steps executed since the reset
@@ -33,7 +33,7 @@ LOG_SCALE = ("vla_action", "log_scale")  # float32 [*B, C, 7], the scale head's 
 LOG_PROBS = ("vla_action", "log_probs")  # float32 [*B, C], summed over the 7 dimensions
 ACTION_IS_PAD = "action_is_pad"  # bool [*B, C]
 
-FRAMES = "frames"  # uint8 [*B, C, 3, H, W], what one decision produced
+FRAMES = "frames"  # ("frames", entry) uint8 [*B, C, 3, H, W] by camera, what one decision produced; see frames_key
 STATES = "states"  # float32 [*B, C, 7], the proprioception that goes with the frames
 KINEMATIC_STATES = "kinematic_states"  # float32 [*B, C, 20]
 STEP_MASK = "step_mask"  # bool [*B, C], steps of the chunk that were executed
@@ -50,3 +50,20 @@ TERMINATIONS = ("running", "success", "reflector", "step limit", "cut short")
 ROW = "row"  # int64 [*B, 1], the env's row a recorded rollout ran in
 EPISODE = "episode"  # int64 [*B, 1], how many rollouts that row had begun before
 MASK = ("collector", "mask")  # bool [*B], entries that belong to a rollout (False after its end)
+
+_IMAGE_ENTRIES = {"agentview": "image", "wrist": "wrist_image"}  # TorchRL's names; any other camera keeps its own
+
+
+def image_entry(camera: str) -> str:
+    """What a scene's ``camera`` is called below ``observation`` and ``frames``."""
+    return _IMAGE_ENTRIES.get(camera, camera)
+
+
+def image_key(camera: str) -> tuple[str, str]:
+    """Where the current image of a scene's ``camera`` is: uint8 [*B, 3, H, W]."""
+    return ("observation", image_entry(camera))
+
+
+def frames_key(camera: str) -> tuple[str, str]:
+    """Where the images of a scene's ``camera`` over a chunk are: uint8 [*B, C, 3, H, W]."""
+    return (FRAMES, image_entry(camera))
