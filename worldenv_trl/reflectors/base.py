@@ -3,89 +3,88 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-__all__ = ["Reflector", "prefix_indices"]
+from worldenv_trl.language import SeenInstructions
+
+if TYPE_CHECKING:
+    from worldenv_trl.data import Episodes
+
+__all__ = ["Lesson", "Reflector"]
 
 
-def prefix_indices(lengths: Tensor, num_frames: int) -> Tensor:
-    """Which frames of a prefix are looked at: spread evenly, the first and the last among them.
+@dataclass(frozen=True)
+class Lesson:
+    """One stage of a reflector's training: what is updated, on what, and for how long."""
 
-    Args:
-        lengths: int64 ``[P]``, frames in each prefix, at least 1.
-        num_frames: most frames looked at.
-
-    Returns:
-        int64 ``[P, L]`` with ``L = min(num_frames, max(lengths))``; shorter prefixes repeat their last frame.
-    """
-    count = int(min(num_frames, int(lengths.max())))
-    slots = torch.arange(count, device=lengths.device)
-    shown = lengths.clamp(max=count)
-    spread = (slots * (lengths - 1).unsqueeze(-1)).float() / (shown - 1).clamp(min=1).unsqueeze(-1)
-    return torch.minimum(spread.round().long(), (lengths - 1).unsqueeze(-1))
+    name: str
+    parameters: list[nn.Parameter]
+    sample: Callable[[], TensorDict]
+    """Draws a batch, as :meth:`Reflector.training_loss` reads it."""
+    steps: int
+    lr: float
+    weight_decay: float = 0.0
 
 
 class Reflector(nn.Module, abc.ABC):
-    """Frozen encoder and reward head.
+    """Judges videos as they grow.
 
-    Subclasses encode frames one by one and score prefixes of the features; :meth:`prefix_scores` gives the scores of
-    all prefixes of a chunk in one batch.
+    A subclass calls ``super().__init__`` with what it is trained for, and implements :meth:`begin` and :meth:`extend`;
+    one that learns also :meth:`train_on` and :meth:`training_loss`.
+
+    Keyword Args:
+        cameras: scene cameras whose frames it looks at.
+        image_size: height and width of the frames (px), None for any.
+        instructions: those it is trained on; others are answered with a warning.
     """
 
-    num_frames: int = 32
-    feature_dim: int
+    def __init__(
+        self,
+        *,
+        cameras: Sequence[str] = ("agentview",),
+        image_size: int | None = None,
+        instructions: Sequence[str] = (),
+    ) -> None:
+        super().__init__()
+        if not cameras or len(set(cameras)) < len(cameras):
+            raise ValueError(f"cameras must name at least one camera, each once, got {tuple(cameras)}")
+        self.cameras, self.image_size = tuple(cameras), image_size
+        self.seen = SeenInstructions(f"the reflector {type(self).__name__}", instructions)
+
+    @property
+    def instructions(self) -> tuple[str, ...]:
+        """What it was trained on."""
+        return self.seen.instructions
 
     @abc.abstractmethod
-    def encode(self, frames: Tensor) -> Tensor:
-        """Features ``[n, F]`` of frames uint8 ``[n, 3, H, W]``; never differentiated."""
-
-    @abc.abstractmethod
-    def logits(self, features: Tensor, lengths: Tensor, task_id: Tensor) -> Tensor:
-        """Log-odds ``[P]`` that the task is done.
+    def begin(self, frames: Mapping[str, Tensor], instructions: Sequence[str]) -> TensorDict:
+        """The state [n] of n videos of which only the first frame is known.
 
         Args:
-            features: ``[P, L, F]``, sampled frames of each prefix in order, short ones padded at the end.
-            lengths: int64 ``[P]``, frames in use.
-            task_id: int64 ``[P, 1]``.
-        """
-
-    def score(self, features: Tensor, lengths: Tensor, task_id: Tensor) -> Tensor:
-        """Probabilities ``[P]``; see :meth:`logits`."""
-        return self.logits(features, lengths, task_id).sigmoid()
-
-    def sample_prefixes(
-        self, features: Tensor, rows: Tensor, lengths: Tensor, num_frames: int | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Evenly sampled frames of prefixes: ``[P, L, F]`` and how many are in use ``[P]``.
-
-        Args:
-            features: ``[B, T, F]`` of whole videos.
-            rows: int64 ``[P]``, the video of each prefix.
-            lengths: int64 ``[P]``, its number of frames.
-            num_frames: most frames looked at; the reflector's own when None.
-        """
-        index = prefix_indices(lengths, self.num_frames if num_frames is None else num_frames)
-        return features[rows.unsqueeze(-1), index], lengths.clamp(max=index.shape[1])
-
-    def prefix_scores(
-        self, features: Tensor, first: Tensor, count: int, task_id: Tensor, num_frames: int | None = None
-    ) -> Tensor:
-        """Scores of the prefixes that end at each of ``count`` new frames, in one batch.
-
-        Args:
-            features: ``[B, T, F]`` of all frames so far, the new ones included.
-            first: int64 ``[B]``, frames before the new ones.
-            count: new frames ``C``.
-            task_id: int64 ``[B, 1]``.
-            num_frames: most frames of a prefix that are looked at; the reflector's own when None.
+            frames: uint8 [n, 3, H, W] by camera.
+            instructions: n texts.
 
         Returns:
-            ``[B, C]``: entry k is the score of the prefix of ``first + k + 1`` frames.
+            TensorDict [n]: ``score`` float32 [n], R of the first frame, and whatever else the reflector keeps (features,
+            not frames). Entries may grow along their second dimension from call to call, padded with zeros.
         """
-        batch = len(features)
-        lengths = (first.unsqueeze(-1) + torch.arange(1, count + 1, device=first.device)).flatten()
-        rows = torch.arange(batch, device=first.device).repeat_interleave(count)
-        sampled, used = self.sample_prefixes(features, rows, lengths, num_frames)
-        return self.score(sampled, used, task_id[rows]).reshape(batch, count)
+
+    @abc.abstractmethod
+    def extend(self, state: TensorDictBase, frames: Mapping[str, Tensor]) -> tuple[TensorDict, Tensor]:
+        """The state after the next C frames, uint8 [n, C, 3, H, W] by camera, and R after each of them, [n, C]."""
+
+    def train_on(self, episodes: Episodes) -> Iterator[Lesson]:
+        """The lessons to train on labelled ``episodes``, one after the other; none for a reflector that is not trained.
+
+        A lesson is asked for when the one before is over, so that it may build on what was learned.
+        """
+        return iter(())
+
+    def training_loss(self, batch: TensorDictBase) -> TensorDict:
+        """``loss_reflector`` (scalar) and the detached ``accuracy`` of a batch that a lesson drew."""
+        raise TypeError(f"{type(self).__name__} is not trained: it has no lessons")
