@@ -47,7 +47,8 @@ class ImaginedEnv(EnvBase):
     active rows only.
 
     A rollout is a function of (seed, context, rollout index, how often this row was reset, actions), never of the other
-    rows: the world model gets a noise seed per row and chunk.
+    rows: the world model gets a noise seed per row and chunk. Of a rollout's frames those are kept that the world model
+    will ask for (its ``memory_indices`` at whole chunks); the others are shown once, in ``frames``.
 
     Args:
         world_model: paints the active rows. Its cameras, image size and chunk length are the env's.
@@ -107,12 +108,15 @@ class ImaginedEnv(EnvBase):
 
     def _make_buffers(self) -> None:
         rows, length = self.batch_size.numel(), self.max_steps + self.chunk_length  # the last chunk may overshoot
+        image = (3, self.image_size, self.image_size)
 
         def buffer(name: str, *shape: int, dtype: torch.dtype) -> None:
             self.register_buffer(name, torch.zeros(rows, *shape, dtype=dtype, device=self.device), persistent=False)
 
-        for camera in self.cameras:  # o_0..o_t of every row: the world model's memory
-            buffer(f"_video_{camera}", length, 3, self.image_size, self.image_size, dtype=torch.uint8)
+        kept, self._slot = self._remembered(length)
+        for camera in self.cameras:
+            buffer(f"_memory_{camera}", kept, *image, dtype=torch.uint8)
+            buffer(f"_image_{camera}", *image, dtype=torch.uint8)
         buffer("_poses", length, POSE_DIM, dtype=torch.float32)
         buffer("_kinematic", 2, KINEMATIC_DIM, dtype=torch.float32)  # at the start, now
         buffer("_state", 2, STATE_DIM, dtype=torch.float32)
@@ -126,19 +130,23 @@ class ImaginedEnv(EnvBase):
         self._text_stack: NonTensorStack | None = None
         self._begun = [False] * self.batch_size[0]  # groups that have a context
 
-    def _video(self, camera: str) -> Tensor:
-        """uint8 [G * N, steps, 3, H, W]."""
-        return self.get_buffer(f"_video_{camera}")
+    def _remembered(self, length: int) -> tuple[int, Tensor]:
+        """How many frames of a rollout the world model will ever ask for, and where each is kept: int64 [length], -1
+        for those that are not."""
+        decisions = torch.arange(0, self.max_steps, self.chunk_length)
+        wanted = torch.cat([torch.zeros(1, dtype=torch.int64), self.world_model.memory_indices(decisions).flatten()])
+        numbers = wanted.unique()
+        slot = torch.full((length,), -1)
+        slot[numbers] = torch.arange(len(numbers))
+        return len(numbers), slot.to(self.device)
 
-    def painted(self, decisions: int) -> TensorDict:
-        """What the rollouts at hand have shown in their first decisions, not copied: ``("frames", entry)`` uint8
-        [G, N, decisions, C, 3, H, W] of each camera. Past a rollout's end there is whatever was painted before."""
-        steps = decisions * self.chunk_length
-        out = TensorDict(batch_size=[*self.batch_size, decisions], device=self.device)
-        for camera in self.cameras:
-            chunks = self._video(camera)[:, 1 : steps + 1].unflatten(1, (decisions, self.chunk_length))
-            out[frames_key(camera)] = chunks.unflatten(0, self.batch_size)
-        return out
+    def _kept(self, camera: str) -> Tensor:
+        """The frames that may be asked for: uint8 [G * N, K, 3, H, W]."""
+        return self.get_buffer(f"_memory_{camera}")
+
+    def _image(self, camera: str) -> Tensor:
+        """What is seen now: uint8 [G * N, 3, H, W]."""
+        return self.get_buffer(f"_image_{camera}")
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = int(torch.randint(2**31, ()).item()) if seed is None else int(seed)
@@ -201,7 +209,7 @@ class ImaginedEnv(EnvBase):
         """Put the contexts ``start`` [n] into ``rows`` [n]."""
         start = start.to(self.device)
         for camera in self.cameras:
-            self._video(camera)[rows, 0] = start[image_key(camera)]
+            self._kept(camera)[rows, 0] = self._image(camera)[rows] = start[image_key(camera)]
         self._state[rows] = start[STATE].unsqueeze(1)
         self._kinematic[rows] = start[KINEMATIC_STATE].unsqueeze(1)
         self._poses[rows, 0] = self.kinematics.pose(start[KINEMATIC_STATE])
@@ -265,8 +273,10 @@ class ImaginedEnv(EnvBase):
         offset = torch.arange(1, length + 1, device=self.device)
         written = now.unsqueeze(-1) + offset
         frames = {camera: self._checked_frames(painted, camera, count) for camera in self.cameras}
+        slot = self._slot[written]
+        of, step = (slot >= 0).nonzero(as_tuple=True)
         for camera, video in frames.items():
-            self._video(camera)[row, written] = video
+            self._kept(camera)[rows[of], slot[of, step]] = video[of, step]
         self._poses[row, written] = poses
         executed = (self.max_steps - now).clamp(max=length)  # at least 1: rows at max_steps are not active
         last = torch.arange(count, device=self.device), executed - 1
@@ -287,12 +297,14 @@ class ImaginedEnv(EnvBase):
             (NOISE_SEED, seeds),
         ):
             out[key].flatten(0, 1)[rows] = value  # a view: written in place
+        for camera, video in frames.items():
+            self._image(camera)[rows] = video[last]
 
     def _recall(self, row: Tensor, numbers: Tensor) -> TensorDict:
         """Frames and poses [n, K] of rows [n, 1] by their numbers [n, K]."""
         out = TensorDict({"poses": self._poses[row, numbers]}, batch_size=numbers.shape, device=self.device)
         for camera in self.cameras:
-            out[frames_key(camera)] = self._video(camera)[row, numbers]
+            out[frames_key(camera)] = self._kept(camera)[row, self._slot[numbers]]
         return out
 
     def _checked_frames(self, painted: TensorDictBase, camera: str, count: int) -> Tensor:
@@ -322,8 +334,7 @@ class ImaginedEnv(EnvBase):
     def _observe(self) -> TensorDictBase:
         """The current observation of all rows, with an empty chunk: what a reset, or a row not stepped, shows."""
         batch, chunk, image = self.batch_size, self.chunk_length, (3, self.image_size, self.image_size)
-        rows = torch.arange(len(self._steps), device=self.device)
-        images = {image_entry(name): self._video(name)[rows, self._steps].unflatten(0, batch) for name in self.cameras}
+        images = {image_entry(name): self._image(name).clone().unflatten(0, batch) for name in self.cameras}
         if self._text_stack is None:
             self._text_stack = NonTensorStack(*self._text).reshape(batch)
 
@@ -332,13 +343,7 @@ class ImaginedEnv(EnvBase):
 
         out = TensorDict(
             {
-                "observation": {
-                    **{
-                        image_entry(name): self._video(name)[rows, self._steps].unflatten(0, batch)
-                        for name in self.cameras
-                    },
-                    "state": self._state[:, 1].clone().unflatten(0, batch),
-                },
+                "observation": images | {"state": self._state[:, 1].clone().unflatten(0, batch)},
                 KINEMATIC_STATE: self._kinematic[:, 1].clone().unflatten(0, batch),
                 TASK_ID: self._task.clone().unflatten(0, batch),
                 CONTEXT_ID: self._context.clone().unflatten(0, batch),
