@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from worldenv_trl.kinematics import ActionMap
-from worldenv_trl.scenes.camera import Camera, look_at
+from worldenv_trl.robot import Camera, look_at
 
 FRONT = look_at("front", (0.75, 0.1, 0.55), (0.0, 0.0, 0.1), 45.0)
 SIDE = look_at("side", (0.0, -0.8, 0.4), (0.0, 0.0, 0.1), 40.0)
