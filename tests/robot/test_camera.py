@@ -1,5 +1,8 @@
 """The camera model against MuJoCo's renderer and its wrist camera."""
 
+import dataclasses
+import json
+
 import mujoco
 import numpy as np
 import pytest
@@ -70,3 +73,8 @@ def test_the_wrist_camera_rides_on_the_tool_as_mujoco_has_it():
 def test_a_camera_is_mounted_on_the_world_or_the_tool():
     with pytest.raises(ValueError, match="mount must be 'world' or 'tool', got 'hand'"):
         Camera("side", (0.0, 0.0, 0.0), WRIST.rotation, 40.0, mount="hand")
+
+
+def test_a_camera_read_from_json_is_the_one_that_was_written():
+    again = Camera(**json.loads(json.dumps(dataclasses.asdict(WRIST))))
+    assert again == WRIST and hash(again) == hash(WRIST)

@@ -33,6 +33,9 @@ class Camera:
     def __post_init__(self) -> None:
         if self.mount not in ("world", "tool"):
             raise ValueError(f"mount must be 'world' or 'tool', got {self.mount!r}")
+        # A camera read from JSON, where tuples are lists, is the one that was written.
+        object.__setattr__(self, "position", tuple(float(value) for value in self.position))
+        object.__setattr__(self, "rotation", tuple(tuple(float(value) for value in row) for row in self.rotation))
 
     def intrinsics(self, size_px: int) -> np.ndarray:
         """``[3, 3]`` matrix for a square image; pixel centres lie at half-integers."""
@@ -60,7 +63,7 @@ def look_at(name: str, position: tuple[float, float, float], target: tuple[float
     right = np.cross((0.0, 0.0, 1.0), back)
     right = right / np.linalg.norm(right)
     rotation = np.stack([right, np.cross(back, right), back], 1)
-    return Camera(name, tuple(position), tuple(tuple(row) for row in rotation.tolist()), fovy)
+    return Camera(name, position, tuple(map(tuple, rotation.tolist())), fovy)
 
 
 # Where LIBERO's eye-in-hand camera sits: on the palm's edge, 5 cm beside the fingers' plane, and looks along them.
