@@ -19,9 +19,9 @@ from torchrl.envs.utils import step_mdp
 from command_line import at_least, refusals
 from task_names import SUITES
 from worldenv_trl import keys
+from worldenv_trl.context_ids import SPLITS
 from worldenv_trl.envs import ExpertPolicy, TabletopEnv
 from worldenv_trl.scenes import RendererPool, list_tasks
-from worldenv_trl.scenes.tasks import SPLITS
 
 _IMAGES = {"agentview": keys.IMAGE, "wrist": keys.WRIST_IMAGE}
 

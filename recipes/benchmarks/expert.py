@@ -19,9 +19,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the recipes besi
 
 from command_line import at_least, refusals
 from task_names import SUITES, named_tasks
+from worldenv_trl.context_ids import SPLITS
 from worldenv_trl.metrics import wilson_interval
 from worldenv_trl.scenes import SceneBatch, ScriptedExpert, list_suites, load_task
-from worldenv_trl.scenes.tasks import SPLITS
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from worldenv_trl import keys
 from worldenv_trl.data import WindowSampler, predicted_poses, world_model_windows
 from worldenv_trl.kinematics import ForwardKinematics
-from worldenv_trl.scenes import panda
+from worldenv_trl.robot import panda
 
 CHUNK = 4
 

@@ -28,7 +28,8 @@ from worldenv_trl.keys import (
 )
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.record import read_rollouts, recorded
-from worldenv_trl.scenes import list_tasks, panda
+from worldenv_trl.robot import panda
+from worldenv_trl.scenes import list_tasks
 
 SIZE, C = 16, 4
 FK = ForwardKinematics()

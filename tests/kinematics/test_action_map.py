@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from worldenv_trl.kinematics import ActionMap
-from worldenv_trl.scenes.camera import Camera, look_at
+from worldenv_trl.robot import WRIST, Camera, look_at, panda
+from worldenv_trl.scenes import load_task
 
 FRONT = look_at("front", (0.75, 0.1, 0.55), (0.0, 0.0, 0.1), 45.0)
 SIDE = look_at("side", (0.0, -0.8, 0.4), (0.0, 0.0, 0.1), 40.0)
@@ -145,19 +146,77 @@ def test_nothing_is_drawn_for_a_hand_behind_the_camera_or_outside_the_image():
     assert not action_map(make_pose((0.0, 3.0, 0.1))).any()
 
 
-def test_every_task_has_its_own_camera():
-    both, poses = ActionMap({0: FRONT, 3: SIDE}, 32), random_poses(4, 2)
-    maps = both(poses, torch.tensor([[0], [3], [3], [0]]))
+def test_each_element_is_seen_by_the_camera_of_its_index():
+    both, poses = ActionMap([FRONT, SIDE], 32), random_poses(4, 2)
+    index = torch.tensor([0, 1, 1, 0])
     front, side = ActionMap(FRONT, 32)(poses), ActionMap(SIDE, 32)(poses)
-    assert torch.allclose(maps, torch.stack([front[0], side[1], side[2], front[3]]), atol=1e-5)
-    points = both.project(poses[:, 0, :3], torch.tensor([0, 3, 3, 0]))
+    expected = torch.stack([front[0], side[1], side[2], front[3]])
+    for same in (index, index[:, None], index[:, None].expand(4, 2), index[:, None, None].expand(4, 2, 1)):
+        assert torch.allclose(both(poses, same), expected, atol=1e-5)
+    points = both.project(poses[:, 0, :3], index)
     assert torch.allclose(points[1], ActionMap(SIDE, 32).project(poses[1, 0, :3]), atol=1e-4)
 
 
-def test_one_camera_serves_every_task():
-    poses = random_poses(3)
-    single = ActionMap(FRONT, 32)
-    assert torch.equal(single(poses, torch.tensor([[0], [5], [9]])), single(poses))
+def test_one_camera_needs_no_index_and_takes_its_own():
+    poses, single = random_poses(3), ActionMap([SIDE], 32)
+    assert torch.equal(single(poses, torch.zeros(3, dtype=torch.int64)), single(poses))
+    assert torch.equal(single(poses), ActionMap(SIDE, 32)(poses))
+
+
+# ----------------------------------------------------------------------------------------------------- on the tool
+
+
+def on_the_wrist(count: int):
+    """Poses of the tool [n, 13], points around it [n, 3] and where MuJoCo's wrist camera sees them [n, 2] at 64 px."""
+    model = load_task("starter/put_the_bowl_on_the_plate").build()
+    data, camera, site = mujoco.MjData(model), model.camera("panda/wrist").id, model.site("panda/tcp").id
+    arm = [model.joint(f"panda/{joint.name}").qposadr[0] for joint in panda.JOINTS]
+    rng, poses, points, seen = np.random.default_rng(0), [], [], []
+    focal = 32 / math.tan(math.radians(model.cam_fovy[camera]) / 2)
+    for angles in panda.HOME_Q + 0.3 * rng.standard_normal((count, 7)):
+        data.qpos[arm] = angles
+        mujoco.mj_forward(model, data)
+        local = rng.uniform((-0.05, -0.05, -0.4), (0.05, 0.05, -0.1))  # in front of the camera, in its axes
+        points.append(data.cam_xpos[camera] + data.cam_xmat[camera].reshape(3, 3) @ local)
+        seen.append(32 + focal * local[:2] * (1, -1) / -local[2])
+        poses.append(np.concatenate([data.site_xpos[site], data.site_xmat[site], [rng.uniform()]]))
+    return [torch.as_tensor(np.stack(part), dtype=torch.float32) for part in (poses, points, seen)]
+
+
+def test_the_wrist_camera_sees_points_where_mujoco_s_does():
+    poses, points, seen = on_the_wrist(40)
+    pixels = ActionMap(WRIST, 64).project(points, tool_pose=poses)
+    assert (pixels - seen).norm(dim=-1).max() < 1e-2
+    assert (pixels - ActionMap(WRIST, 64).project(points, tool_pose=poses[:1])).norm(dim=-1)[1:].min() > 0.1
+
+
+def test_the_wrist_camera_draws_a_later_pose_from_where_it_is_now():
+    now, later, _ = on_the_wrist(6)
+    later = torch.cat([later, now[:, 3:]], -1)  # the same turn of the tool, at the points in front of the camera
+    maps, action_map = ActionMap(WRIST, 64)(later, tool_pose=now), ActionMap(WRIST, 64)
+    for image, pixel in zip(maps[:, 0], action_map.project(later[:, :3], tool_pose=now), strict=True):
+        if pixel.min() > 6 and pixel.max() < 58:
+            assert (centroid(image) - pixel).norm() < 1.0
+    still = [centroid(image) for image in action_map(now, tool_pose=now)[:, 0]]
+    assert all((place - still[0]).norm() < 1e-2 for place in still)  # the hand itself does not move in its own picture
+
+
+def test_a_fixed_camera_beside_the_wrist_s_draws_bit_for_bit_what_it_drew_alone():
+    poses = random_poses(5, 3)
+    both, index = ActionMap([FRONT, WRIST], 32), torch.tensor([0, 1, 0, 1, 0])
+    alone = ActionMap(FRONT, 32)
+    maps = both(poses, index, poses[:, :1])
+    assert torch.equal(maps[::2], alone(poses[::2]))
+    assert torch.equal(maps[1::2], ActionMap(WRIST, 32)(poses[1::2], tool_pose=poses[1::2, :1]))
+    assert torch.equal(both(poses, torch.zeros(5, dtype=torch.int64)), alone(poses))  # no tool pose where none is used
+    assert torch.equal(both.project(poses[..., :3], index, poses)[0], alone.project(poses[0, :, :3]))
+
+
+def test_maps_of_the_wrist_are_differentiable_in_where_the_tool_is():
+    now, points, _ = on_the_wrist(3)
+    now.requires_grad_()
+    ActionMap(WRIST, 32).project(points, tool_pose=now).sum().backward()
+    assert now.grad.isfinite().all() and now.grad[:, :12].abs().amax(0).min() > 0
 
 
 def test_maps_are_differentiable_in_the_pose():
@@ -171,12 +230,41 @@ def test_maps_are_differentiable_in_the_pose():
 def test_wrong_input_is_refused():
     with pytest.raises(ValueError, match="at least 16 px"):
         ActionMap(FRONT, 8)
-    with pytest.raises(ValueError, match="empty mapping"):
-        ActionMap({}, 32)
+    with pytest.raises(ValueError, match="empty sequence"):
+        ActionMap([], 32)
     with pytest.raises(ValueError, match=r"pose must be \[\*B, 13\]"):
         ActionMap(FRONT, 32)(torch.zeros(2, 7))
-    both = ActionMap({0: FRONT, 3: SIDE}, 32)
-    with pytest.raises(ValueError, match="task_id is needed"):
-        both(random_poses(2))
-    with pytest.raises(ValueError, match="no camera for task id 1"):
-        both(random_poses(2), torch.tensor([0, 1]))
+
+
+@pytest.mark.parametrize(
+    ("cameras", "index", "message"),
+    [
+        ((FRONT, SIDE), None, "camera_index is needed: this map has 2 cameras, front, side"),
+        ((FRONT, SIDE), torch.tensor([0, 2]), r"camera_index must be in \[0, 2\), the cameras of this map, got 2"),
+        ((FRONT, SIDE), torch.tensor([-1, 0]), "got -1"),
+        ((FRONT,), torch.tensor([0, 5]), r"camera_index must be in \[0, 1\), the cameras of this map, got 5"),
+        ((FRONT, SIDE), torch.tensor([0.0, 1.0]), "camera_index must be whole numbers, got torch.float32"),
+        ((FRONT, SIDE), torch.tensor([0, 1, 0]), r"camera_index must be \[2\], .* got \[3\]"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(cameras, index, message):
+    action_map, poses = ActionMap(cameras, 32), random_poses(2)
+    for call in (lambda: action_map(poses, index), lambda: action_map.project(poses[:, :3], index)):
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+def test_a_camera_on_the_tool_needs_to_know_where_the_tool_is():
+    poses, both = random_poses(2), ActionMap([FRONT, WRIST], 32)
+    used = torch.tensor([0, 1])
+    for call in (
+        lambda: ActionMap(WRIST, 32)(poses),
+        lambda: both(poses, used),
+        lambda: both.project(poses[:, :3], used),
+    ):
+        with pytest.raises(ValueError, match="tool_pose is needed, as the camera wrist is mounted on the tool"):
+            call()
+    with pytest.raises(ValueError, match=r"tool_pose must be \[\*B, 13\]"):
+        both(poses, used, poses[:, :12])
+    with pytest.raises(ValueError, match=r"tool_pose must broadcast to \[2, 13\], got \[3, 13\]"):
+        both(poses, used, random_poses(3))

@@ -10,7 +10,9 @@ import pytest
 import torch
 
 from worldenv_trl.kinematics import ForwardKinematics
-from worldenv_trl.scenes import controller, panda
+from worldenv_trl.robot import panda
+from worldenv_trl.scenes import controller
+from worldenv_trl.scenes.panda import Panda
 
 FK = ForwardKinematics()
 HOME = torch.as_tensor(panda.HOME_Q, dtype=torch.float32)
@@ -33,7 +35,7 @@ def rotation(pose: torch.Tensor) -> torch.Tensor:
 
 
 def test_the_tool_centre_is_where_mujoco_puts_it():
-    model = panda.Panda().mjcf_model
+    model = Panda().mjcf_model
     physics = mujoco.MjModel.from_xml_string(model.to_xml_string())
     data, site = mujoco.MjData(physics), mujoco.mj_name2id(physics, mujoco.mjtObj.mjOBJ_SITE, "tcp")
     q = random_joints(100)

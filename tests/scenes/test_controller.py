@@ -5,7 +5,8 @@ import math
 import mujoco
 import numpy as np
 
-from worldenv_trl.scenes import controller, load_task, panda
+from worldenv_trl.robot import panda
+from worldenv_trl.scenes import controller, load_task
 
 RNG = np.random.default_rng(0)
 

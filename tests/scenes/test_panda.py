@@ -1,10 +1,11 @@
-"""The arm: the published numbers, the same in MuJoCo and in URDF, and servos that hold it."""
+"""The arm in MuJoCo: the published numbers, and servos that hold it."""
 
 import mujoco
 import numpy as np
 import pytest
 
-from worldenv_trl.scenes import SceneBatch, controller, load_task, panda
+from worldenv_trl.robot import panda
+from worldenv_trl.scenes import SceneBatch, controller, load_task
 
 MODEL = load_task("starter/open_the_top_drawer").build()
 
@@ -33,12 +34,6 @@ def test_home_is_inside_the_limits_with_the_hand_straight_down():
     position, rotation, _ = controller.forward_kinematics(panda.HOME_Q[None])
     assert (position[0] > panda.WORKSPACE_LOW).all() and (position[0] < panda.WORKSPACE_HIGH).all()
     assert np.degrees(np.arccos(-rotation[0, 2, 2])) < 0.1
-
-
-def test_urdf_names_every_joint_and_ends_at_the_tcp():
-    text = panda.urdf()
-    assert text.count('type="revolute"') == 7 and '<link name="tcp"/>' in text
-    assert all(f'name="{joint.name}"' in text for joint in panda.JOINTS)
 
 
 def test_the_servos_hold_the_arm_still_for_two_seconds():

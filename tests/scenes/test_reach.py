@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from worldenv_trl.scenes import controller, panda
+from worldenv_trl.robot import panda
+from worldenv_trl.scenes import controller
 from worldenv_trl.scenes.reach import out_of_reach
 
 

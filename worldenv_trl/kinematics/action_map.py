@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-if TYPE_CHECKING:
-    from worldenv_trl.scenes.camera import Camera
+from worldenv_trl.keys import POSE_DIM
+from worldenv_trl.robot import Camera
+from worldenv_trl.robot.panda import FINGER_TRAVEL
 
 __all__ = ["ActionMap"]
 
 _NEAR = 0.05  # metres in front of the camera; nothing nearer is drawn
-_FINGER_TRAVEL = 0.04  # metres from the tool centre to a fully open fingertip
 _ROWS_PER_CHUNK = 64  # keeps the temporaries of a chunk inside the CPU cache
 
 
@@ -33,9 +32,11 @@ class ActionMap(nn.Module):
 
     All marks are distance fields, antialiased and differentiable in the pose; a hand behind the camera draws nothing.
 
+    A camera that is mounted on the tool moves with it: its images are taken from where the tool is then, ``tool_pose``,
+    which need not be the pose that is drawn.
+
     Args:
-        camera: one :class:`~worldenv_trl.scenes.camera.Camera`, or a mapping from task id to camera; anything with
-            ``position``, ``rotation`` (world from camera, looking along -z) and ``fovy`` or ``fovy_deg`` (degrees).
+        camera: one :class:`~worldenv_trl.robot.Camera` or several, which ``camera_index`` then chooses from.
         size: image side in pixels, or ``(height, width)``. Pixels are square; ``fovy`` spans the height.
 
     Keyword Args:
@@ -44,8 +45,10 @@ class ActionMap(nn.Module):
         disc_radius: radius of the disc and the drop shadow (m).
 
     Examples:
-        >>> action_map = ActionMap(camera, 64)  # doctest: +SKIP
-        >>> action_map(pose).shape  # pose [16, 8, 13]  # doctest: +SKIP
+        >>> from worldenv_trl.robot import WRIST, look_at
+        >>> action_map = ActionMap([look_at("front", (0.8, 0.0, 0.6), (0.0, 0.0, 0.1), 40.0), WRIST], 64)
+        >>> poses = torch.zeros(16, 8, 13)
+        >>> action_map(poses, torch.zeros(16, 1, dtype=torch.int64)).shape
         torch.Size([16, 8, 6, 64, 64])
     """
 
@@ -53,7 +56,7 @@ class ActionMap(nn.Module):
 
     def __init__(
         self,
-        camera: Camera | Mapping[int, Camera],
+        camera: Camera | Sequence[Camera],
         size: int | tuple[int, int],
         *,
         table_height: float = 0.0,
@@ -67,100 +70,147 @@ class ActionMap(nn.Module):
         self.height, self.width = int(height), int(width)
         self.table_height, self.axis_length, self.disc_radius = table_height, axis_length, disc_radius
 
-        cameras = dict(camera) if isinstance(camera, Mapping) else {0: camera}
+        cameras = [camera] if isinstance(camera, Camera) else list(camera)
         if not cameras:
-            raise ValueError("camera is an empty mapping: give at least one task id -> Camera")
-        if min(cameras) < 0:
-            raise ValueError(f"task ids must not be negative, got {min(cameras)}")
-        self._per_task = isinstance(camera, Mapping) and len(cameras) > 1
-        ids = sorted(cameras)
-        lookup = torch.full((ids[-1] + 1,), -1, dtype=torch.int64)
-        lookup[torch.tensor(ids)] = torch.arange(len(ids))
-        positions = [torch.as_tensor(cameras[i].position, dtype=torch.float32) for i in ids]
-        rotations = [torch.as_tensor(cameras[i].rotation, dtype=torch.float32).reshape(3, 3) for i in ids]
-        fovy = torch.tensor([_fovy_deg(cameras[i]) for i in ids]).deg2rad()
+            raise ValueError("camera is an empty sequence: give at least one Camera")
+        positions = [torch.tensor(item.position, dtype=torch.float32) for item in cameras]
+        rotations = [torch.tensor(item.rotation, dtype=torch.float32).reshape(3, 3) for item in cameras]
+        fovy = torch.tensor([float(item.fovy) for item in cameras]).deg2rad()
+        on_tool = torch.tensor([item.mount == "tool" for item in cameras])
+        self._names = [item.name for item in cameras]
+        self._any_on_tool, self._all_on_tool = bool(on_tool.any()), bool(on_tool.all())
         # The cameras belong to the configuration of whoever uses the map: not to its weights.
-        self.register_buffer("_lookup", lookup, persistent=False)
         self.register_buffer("_position", torch.stack(positions), persistent=False)
         self.register_buffer("_rotation", torch.stack(rotations), persistent=False)
+        self.register_buffer("_on_tool", on_tool, persistent=False)
         self.register_buffer("_focal", self.height / 2 / torch.tan(fovy / 2), persistent=False)
         self.register_buffer("_column", torch.arange(self.width, dtype=torch.float32) + 0.5, persistent=False)
         self.register_buffer("_row", torch.arange(self.height, dtype=torch.float32) + 0.5, persistent=False)
 
-    def _camera_index(self, batch: torch.Size, task_id: Tensor | None) -> Tensor:
+    def _camera_index(self, batch: torch.Size, camera_index: Tensor | None) -> Tensor:
         """Row of the camera buffers for every element of ``batch``: [*B]."""
-        if task_id is None:
-            if self._per_task:
-                raise ValueError(f"task_id is needed: this map has {len(self._position)} cameras, one per task")
-            return self._lookup.new_zeros(batch)
-        ids = task_id.to(self._lookup.device).long()
-        if ids.shape != batch and ids.ndim and ids.shape[-1] == 1:
-            ids = ids.squeeze(-1)
-        ids = ids.reshape(*ids.shape, *[1] * (len(batch) - ids.ndim)).expand(batch)
-        if not self._per_task and len(self._lookup) == 1:
-            return torch.zeros_like(ids)  # a single camera serves every task
-        known = (ids >= 0) & (ids < len(self._lookup))
-        index = self._lookup[ids.clamp(0, len(self._lookup) - 1)]
-        if not bool((known & (index >= 0)).all()):
-            bad = ids[~(known & (index >= 0))][0].item()
-            served = (self._lookup >= 0).nonzero().flatten().tolist()
-            raise ValueError(f"no camera for task id {bad}; this map has cameras for the task ids {served}")
-        return index
+        count = len(self._position)
+        if camera_index is None:
+            if count > 1:
+                raise ValueError(f"camera_index is needed: this map has {count} cameras, {', '.join(self._names)}")
+            return torch.zeros(batch, dtype=torch.int64, device=self._position.device)
+        if camera_index.is_floating_point() or camera_index.is_complex() or camera_index.dtype == torch.bool:
+            raise ValueError(f"camera_index must be whole numbers, got {camera_index.dtype}")
+        index = camera_index.to(self._position.device).long()
+        if index.shape != batch and index.ndim and index.shape[-1] == 1:
+            index = index.squeeze(-1)
+        if index.shape != batch[: index.ndim]:
+            raise ValueError(
+                f"camera_index must be {list(batch)}, with a last dimension of 1, or a leading part of it, "
+                f"got {list(camera_index.shape)}"
+            )
+        wrong = (index < 0) | (index >= count)
+        if bool(wrong.any()):
+            raise ValueError(
+                f"camera_index must be in [0, {count}), the cameras of this map, got {int(index[wrong][0])}"
+            )
+        return index.reshape(*index.shape, *[1] * (len(batch) - index.ndim)).expand(batch)
 
-    def _project(self, points: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels [*B, P, 2] and depths [*B, P] of world points [*B, P, 3] seen by cameras [*B]."""
-        local = torch.einsum("...pi,...ij->...pj", points - self._position[index].unsqueeze(-2), self._rotation[index])
+    def _views(self, index: Tensor, tool_pose: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Where the cameras [n] of ``index`` are: positions [n, 3] and rotations [n, 3, 3], world from camera."""
+        position, rotation = self._position[index], self._rotation[index]
+        if not self._any_on_tool:
+            return position, rotation
+        on_tool = self._on_tool[index]
+        if tool_pose is None:
+            if self._all_on_tool or bool(on_tool.any()):
+                moving = [name for name, moves in zip(self._names, self._on_tool.tolist(), strict=True) if moves]
+                raise ValueError(
+                    f"tool_pose is needed, as the camera {' and '.join(moving)} is mounted on the tool: pass where the "
+                    "tool is when the picture is taken"
+                )
+            return position, rotation
+        tool = tool_pose[:, 3:12].reshape(-1, 3, 3)
+        moved = tool_pose[:, :3] + torch.einsum("nij,nj->ni", tool, position)
+        on_tool = on_tool.unsqueeze(-1)
+        return torch.where(on_tool, moved, position), torch.where(on_tool.unsqueeze(-1), tool @ rotation, rotation)
+
+    def _tool_poses(self, batch: torch.Size, tool_pose: Tensor | None) -> Tensor | None:
+        """``tool_pose`` as [n, 13] for the flattened ``batch``; None where no camera moves."""
+        if tool_pose is None or not self._any_on_tool:
+            return None
+        if tool_pose.shape[-1] != POSE_DIM:
+            raise ValueError(f"tool_pose must be [*B, 13] (position, rotation, opening), got {list(tool_pose.shape)}")
+        try:
+            return tool_pose.float().expand(*batch, POSE_DIM).reshape(-1, POSE_DIM)
+        except RuntimeError:
+            raise ValueError(f"tool_pose must broadcast to {[*batch, 13]}, got {list(tool_pose.shape)}") from None
+
+    def _project(self, points: Tensor, index: Tensor, tool_pose: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Pixels [n, P, 2], depths [n, P] and pixels per metre [n, P] of points [n, P, 3] seen by cameras [n]."""
+        position, rotation = self._views(index, tool_pose)
+        local = torch.einsum("...pi,...ij->...pj", points - position.unsqueeze(-2), rotation)
         depth = -local[..., 2]
         scale = self._focal[index].unsqueeze(-1) / depth.clamp(min=_NEAR)
         u = self.width / 2 + scale * local[..., 0]
         v = self.height / 2 - scale * local[..., 1]
-        return torch.stack([u, v], -1), depth
+        return torch.stack([u, v], -1), depth, scale
 
-    def project(self, points: Tensor, task_id: Tensor | None = None) -> Tensor:
-        """Pixel coordinates [*B, 2] (u right, v down; the centre of the upper left pixel is (0.5, 0.5)) of world
-        points [*B, 3] in metres. Points less than 5 cm in front of the camera are projected as if they were there."""
-        index = self._camera_index(points.shape[:-1], task_id)
-        return self._project(points.unsqueeze(-2), index)[0].squeeze(-2)
+    def project(self, points: Tensor, camera_index: Tensor | None = None, tool_pose: Tensor | None = None) -> Tensor:
+        """Where points are in the image.
 
-    def forward(self, pose: Tensor, task_id: Tensor | None = None) -> Tensor:
+        Args:
+            points: [*B, 3] in the world (m). Less than 5 cm in front of the camera they are projected as if there.
+            camera_index, tool_pose: see :meth:`forward`.
+
+        Returns:
+            Pixel coordinates [*B, 2]: u right, v down; the centre of the upper left pixel is (0.5, 0.5).
+
+        Raises:
+            ValueError: as :meth:`forward`.
+        """
+        batch = points.shape[:-1]
+        index = self._camera_index(batch, camera_index).reshape(-1)
+        pixels = self._project(points.reshape(-1, 1, 3), index, self._tool_poses(batch, tool_pose))[0]
+        return pixels.reshape(*batch, 2)
+
+    def forward(self, pose: Tensor, camera_index: Tensor | None = None, tool_pose: Tensor | None = None) -> Tensor:
         """Draw poses.
 
         Args:
             pose: [*B, 13]: position (m), rotation (row-major 3x3, world from tool), opening in [0, 1].
-            task_id: integer [*B], [*B, 1] or leading part of it ([b, 1] for poses [b, C, 13]); needed when the map has
-                one camera per task.
+            camera_index: which of the cameras looks, integer [*B], [*B, 1] or leading part of it ([b, 1] for poses
+                [b, C, 13]); needed when there are several.
+            tool_pose: where the tool is when the picture is taken, [*B, 13] or what broadcasts to it; needed when a
+                camera that looks is mounted on the tool.
 
         Returns:
             Float maps [*B, 6, H, W] in [0, 1].
 
         Raises:
-            ValueError: wrong last dimension, missing or unknown task id.
+            ValueError: wrong shapes, an index that is missing or out of range, a missing tool pose.
         """
-        if pose.shape[-1] != 13:
+        if pose.shape[-1] != POSE_DIM:
             raise ValueError(f"pose must be [*B, 13] (position, rotation, opening), got {tuple(pose.shape)}")
         batch = pose.shape[:-1]
-        index = self._camera_index(batch, task_id).reshape(-1)
-        pose = pose.reshape(-1, 13).float()
+        index = self._camera_index(batch, camera_index).reshape(-1)
+        tool = self._tool_poses(batch, tool_pose)
+        pose = pose.reshape(-1, POSE_DIM).float()
         if pose.shape[0] == 0:
             return pose.new_zeros(*batch, self.channels, self.height, self.width)
-        if pose.device.type != "cpu" or (pose.requires_grad and torch.is_grad_enabled()):
-            maps = self._draw(pose, index)
+        inputs = [pose] if tool is None else [pose, tool]
+        if pose.device.type != "cpu" or (any(item.requires_grad for item in inputs) and torch.is_grad_enabled()):
+            maps = self._draw(pose, index, tool)
         else:
             maps = pose.new_empty(pose.shape[0], self.channels, self.height, self.width)
             for first in range(0, pose.shape[0], _ROWS_PER_CHUNK):
                 part = slice(first, first + _ROWS_PER_CHUNK)
-                maps[part] = self._draw(pose[part], index[part])
+                maps[part] = self._draw(pose[part], index[part], None if tool is None else tool[part])
         return maps.reshape(*batch, self.channels, self.height, self.width)
 
-    def _draw(self, pose: Tensor, index: Tensor) -> Tensor:
+    def _draw(self, pose: Tensor, index: Tensor, tool_pose: Tensor | None) -> Tensor:
         position, rotation, opening = pose[:, :3], pose[:, 3:12].reshape(-1, 3, 3), pose[:, 12].clamp(0, 1)
         tool_axes = rotation.transpose(-1, -2)  # [n, axis, 3]: the columns of R
         ends = position.unsqueeze(1) + self.axis_length * tool_axes
-        reach = (_FINGER_TRAVEL * opening).unsqueeze(-1) * tool_axes[:, 1]
+        reach = (FINGER_TRAVEL * opening).unsqueeze(-1) * tool_axes[:, 1]
         table = torch.cat([position[:, :2], torch.full_like(position[:, :1], self.table_height)], -1)
         points = torch.stack([position, *ends.unbind(1), position + reach, position - reach, table], 1)
-        pixels, depth = self._project(points, index)  # [n, 7, 2], [n, 7]
-        metre = self._focal[index].unsqueeze(-1) / depth.clamp(min=_NEAR)  # pixels per metre at every point
+        pixels, depth, metre = self._project(points, index, tool_pose)  # [n, 7, 2], [n, 7], [n, 7]
         visible = (depth > _NEAR).float()
         disc = (self.disc_radius * metre).clamp(min=1.25)
         finger = (0.5 * self.disc_radius * metre).clamp(min=1.0)
@@ -191,10 +241,6 @@ class ActionMap(nn.Module):
         # |p - t d|^2 with t the clamped foot of the perpendicular.
         distance = square - fraction * (2 * along - fraction * length)
         return _coverage(distance, half_width) * (1 - 0.5 * fraction)
-
-
-def _fovy_deg(camera: Camera) -> float:
-    return float(camera.fovy_deg if hasattr(camera, "fovy_deg") else camera.fovy)
 
 
 def _coverage(square_distance: Tensor, radius: Tensor) -> Tensor:

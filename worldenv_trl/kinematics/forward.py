@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from worldenv_trl.keys import ACTION_DIM, KINEMATIC_DIM, POSITION_STEP, ROTATION_STEP
-from worldenv_trl.scenes import panda
+from worldenv_trl.robot import panda
 
 __all__ = ["ForwardKinematics"]
 

@@ -3,7 +3,6 @@
 from worldenv_trl.scenes.rendering import RendererPool  # first: where GL is missing, this says what to install
 
 # isort: split
-from worldenv_trl.scenes.camera import Camera
 from worldenv_trl.scenes.catalogue import list_suites, list_tasks, load_task
 from worldenv_trl.scenes.expert import ScriptedExpert
 from worldenv_trl.scenes.perturbed import PerturbedExpert
@@ -11,7 +10,6 @@ from worldenv_trl.scenes.simulation import SceneBatch
 from worldenv_trl.scenes.tasks import Task
 
 __all__ = [
-    "Camera",
     "PerturbedExpert",
     "RendererPool",
     "SceneBatch",

@@ -1,13 +1,14 @@
-"""Table, floor, lights, camera and robot: what every tabletop scene shares."""
+"""Table, floor, lights, cameras and robot: what every tabletop scene shares."""
 
 from __future__ import annotations
 
 from dm_control import composer, mjcf
 
-from worldenv_trl.scenes import panda
-from worldenv_trl.scenes.camera import Camera, look_at
+from worldenv_trl.robot import WRIST, Camera, look_at
+from worldenv_trl.robot.panda import BASE_POSITION
 from worldenv_trl.scenes.entities.base import Color
 from worldenv_trl.scenes.materials import GRAIN, PLASTER, Material
+from worldenv_trl.scenes.panda import TIMESTEP, USERDATA, Panda
 
 AGENTVIEW = look_at("agentview", (0.78, 0.0, 0.60), (-0.03, 0.0, 0.105), 31.0)
 
@@ -21,7 +22,7 @@ class TabletopArena:
 
     def __init__(
         self,
-        cameras: tuple[Camera, ...] = (AGENTVIEW,),
+        cameras: tuple[Camera, ...] = (AGENTVIEW, WRIST),
         *,
         table: Color = (0.72, 0.70, 0.66, 1),
         wall: Color = (0.45, 0.52, 0.50, 1),
@@ -30,9 +31,9 @@ class TabletopArena:
     ) -> None:
         self.root = root = mjcf.RootElement(model="scene")
         root.compiler.angle = "radian"
-        root.option.set_attributes(timestep=panda.TIMESTEP, integrator="implicitfast", cone="elliptic", impratio=10)
+        root.option.set_attributes(timestep=TIMESTEP, integrator="implicitfast", cone="elliptic", impratio=10)
         root.option.flag.autoreset = "disable"  # a state that blows up must be seen, not silently replaced
-        root.size.nuserdata = panda.USERDATA
+        root.size.nuserdata = USERDATA
         # Round shapes cost by their facets, and shadows cost most of all (software GL).
         root.visual.quality.set_attributes(numslices=10, numstacks=6, numquads=1, shadowsize=0)
         root.visual.map.znear = 0.02
@@ -63,8 +64,12 @@ class TabletopArena:
             **wall_material.of(root),
         )
         for camera in cameras:
-            root.worldbody.add("camera", name=camera.name, pos=camera.position, xyaxes=camera.axes, fovy=camera.fovy)
-        self.attach(panda.Panda("panda"), pos=panda.BASE_POSITION)
+            if camera.mount == "world":
+                root.worldbody.add(
+                    "camera", name=camera.name, pos=camera.position, xyaxes=camera.axes, fovy=camera.fovy
+                )
+        on_tool = tuple(camera for camera in cameras if camera.mount == "tool")
+        self.attach(Panda("panda", on_tool), pos=BASE_POSITION)
 
     def attach(self, entity: composer.Entity, pos=(0.0, 0.0, 0.0)) -> None:
         """Fixes an entity to the world."""

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from worldenv_trl.keys import POSITION_STEP, ROTATION_STEP
-from worldenv_trl.scenes import panda
+from worldenv_trl.robot import panda
 
 
 def _rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:

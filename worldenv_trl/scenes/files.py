@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from worldenv_trl.robot import WRIST
 from worldenv_trl.scenes.bddl import Problem, read_bddl
 from worldenv_trl.scenes.canvas import Glow
 from worldenv_trl.scenes.entities import Primitive
@@ -106,7 +107,7 @@ def load_bddl(
         language=problem.language,
         goal=problem.goal,
         max_steps=max_steps,
-        cameras=(setting_of(problem).camera,),
+        cameras=(setting_of(problem).camera, WRIST),
         digest=digest,
         states=states,
         problem=problem,
@@ -117,7 +118,7 @@ def load_bddl(
 
 @cache
 def _scene(task: FileTask) -> tuple[dict[str, Primitive], mujoco.MjModel]:
-    return compile_scene(task.problem)
+    return compile_scene(task.problem, task.cameras)
 
 
 @cache

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from worldenv_trl.scenes import panda
+from worldenv_trl.context_ids import SPLITS
+from worldenv_trl.robot import panda
 from worldenv_trl.scenes.simulation import SceneBatch, home_state
-from worldenv_trl.scenes.tasks import SPLITS
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.files import FileTask

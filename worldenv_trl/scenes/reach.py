@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from worldenv_trl.scenes import panda
+from worldenv_trl.robot import panda
 
 __all__ = ["out_of_reach"]
 

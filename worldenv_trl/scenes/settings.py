@@ -9,10 +9,10 @@ from types import MappingProxyType
 
 import mujoco
 
-from worldenv_trl.scenes import panda
+from worldenv_trl.robot import WRIST, Camera, look_at
+from worldenv_trl.robot.panda import BASE_POSITION
 from worldenv_trl.scenes.arena import AGENTVIEW, TabletopArena
 from worldenv_trl.scenes.bddl import Problem, Region
-from worldenv_trl.scenes.camera import Camera, look_at
 from worldenv_trl.scenes.entities import CATEGORIES, Primitive, make_entity
 from worldenv_trl.scenes.entities.base import Color
 from worldenv_trl.scenes.entities.registry import WORKSPACES
@@ -43,7 +43,7 @@ class Setting:
 
     @property
     def origin(self) -> tuple[float, float]:
-        return panda.BASE_POSITION[0] + self.base_distance, 0.0
+        return BASE_POSITION[0] + self.base_distance, 0.0
 
 
 _WIDE = look_at("agentview", (0.86, 0.0, 0.80), (-0.09, 0.0, 0.05), 36.0)
@@ -55,7 +55,7 @@ _LIVING_ROOM = Setting(
 _STUDY = Setting("study_table", 0.55, (0.66, 0.58, 0.48, 1), (0.40, 0.44, 0.55, 1), _WIDE, GRAIN, PLASTER)
 _FLOOR = Setting("floor", 0.60, (0.60, 0.62, 0.64, 1), (0.50, 0.46, 0.42, 1), _WIDE, PARQUET, PLASTER)
 
-_BENCH = Setting("table", -panda.BASE_POSITION[0], (0.72, 0.70, 0.66, 1), (0.45, 0.52, 0.50, 1), AGENTVIEW)
+_BENCH = Setting("table", -BASE_POSITION[0], (0.72, 0.70, 0.66, 1), (0.45, 0.52, 0.50, 1), AGENTVIEW)
 
 SETTINGS: Mapping[str, Setting] = MappingProxyType(
     {
@@ -86,8 +86,11 @@ def setting_of(problem: Problem) -> Setting:
     return SETTINGS[problem.kind]
 
 
-def compile_scene(problem: Problem) -> tuple[dict[str, Primitive], mujoco.MjModel]:
-    """The things of a task file by name, and the scene they make up.
+def compile_scene(
+    problem: Problem, cameras: tuple[Camera, ...] | None = None
+) -> tuple[dict[str, Primitive], mujoco.MjModel]:
+    """The things of a task file by name, and the scene they make up, seen by ``cameras`` (its setting's, and the
+    wrist's, by default).
 
     Raises:
         BDDLError: for an unknown problem class or category, a workspace of another class, a fixture among the objects
@@ -95,7 +98,7 @@ def compile_scene(problem: Problem) -> tuple[dict[str, Primitive], mujoco.MjMode
     """
     setting = setting_of(problem)
     arena = TabletopArena(
-        (setting.camera,),
+        (setting.camera, WRIST) if cameras is None else cameras,
         table=setting.table,
         wall=setting.wall,
         table_material=setting.table_material,

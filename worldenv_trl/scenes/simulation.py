@@ -11,7 +11,9 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from worldenv_trl.scenes import controller, panda
+from worldenv_trl.robot import panda
+from worldenv_trl.scenes import controller
+from worldenv_trl.scenes.panda import SUBSTEPS
 from worldenv_trl.scenes.rendering import RendererPool, Row
 
 if TYPE_CHECKING:
@@ -122,7 +124,7 @@ class SceneBatch:
 
     def _advance(self, rows: np.ndarray, before: np.ndarray) -> np.ndarray:
         """One control step of physics; returns the rows that blew up, put back to where they were."""
-        self.batch.step(rows, nstep=panda.SUBSTEPS, stage=_POSITIONS)
+        self.batch.step(rows, nstep=SUBSTEPS, stage=_POSITIONS)
         # One number a row, wrong wherever something is; almost always nothing is.
         if np.abs(self.qvel).max(initial=0.0) < _MAX_SPEED and np.isfinite(self.qpos).all():
             return rows[:0]

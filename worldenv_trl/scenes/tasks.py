@@ -10,17 +10,15 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from worldenv_trl.context_ids import MOST_STATES, SPLITS
+from worldenv_trl.robot import WRIST, Camera
 from worldenv_trl.scenes.arena import AGENTVIEW
-from worldenv_trl.scenes.camera import Camera
 from worldenv_trl.scenes.canvas import Glow
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.simulation import SceneBatch
 
-__all__ = ["MOST_STATES", "SPLITS", "Task"]
-
-SPLITS = ("train", "test")
-MOST_STATES = 50_000  # of a split: so many numbers are set aside for it, and beyond them begin another's
+__all__ = ["Task"]
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class Task(abc.ABC):
     language: str
     goal: tuple[tuple[str, ...], ...]
     max_steps: int = 64
-    cameras: tuple[Camera, ...] = (AGENTVIEW,)
+    cameras: tuple[Camera, ...] = (AGENTVIEW, WRIST)
 
     @abc.abstractmethod
     def build(self) -> mujoco.MjModel:

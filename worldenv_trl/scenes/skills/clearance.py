@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldenv_trl.scenes import panda
+from worldenv_trl.robot import panda
 from worldenv_trl.scenes.entities import Primitive
 from worldenv_trl.scenes.skills.phase import FINGERTIP, axes, body, tcp
 

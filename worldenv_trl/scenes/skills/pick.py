@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldenv_trl.scenes import panda
+from worldenv_trl.robot import panda
 from worldenv_trl.scenes.entities.base import Grasp
 from worldenv_trl.scenes.files import FileTask
 from worldenv_trl.scenes.relations import inside

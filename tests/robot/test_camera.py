@@ -1,11 +1,14 @@
-"""The camera model against MuJoCo's renderer."""
+"""The camera model against MuJoCo's renderer and its wrist camera."""
+
+import dataclasses
+import json
 
 import mujoco
 import numpy as np
 import pytest
 
+from worldenv_trl.robot import WRIST, Camera, look_at, panda
 from worldenv_trl.scenes import load_task
-from worldenv_trl.scenes.camera import Camera, look_at
 
 SIZE = 96
 CAMERA = look_at("view", (0.7, 0.2, 0.6), (0.0, 0.05, 0.1), 40.0)
@@ -50,3 +53,28 @@ def test_the_task_s_camera_is_the_model_s():
     assert np.allclose(data.cam_xpos[index], camera.position)
     assert np.allclose(data.cam_xmat[index].reshape(3, 3), camera.rotation, atol=1e-6)
     assert model.cam_fovy[index] == camera.fovy
+
+
+def test_the_wrist_camera_rides_on_the_tool_as_mujoco_has_it():
+    task = load_task("starter/put_the_bowl_on_the_plate")
+    assert task.camera("wrist") == WRIST
+    model, place, turn = task.build(), np.array(WRIST.position), np.array(WRIST.rotation)
+    data, camera, tool = mujoco.MjData(model), model.camera("panda/wrist").id, model.site("panda/tcp").id
+    arm = [model.joint(f"panda/{joint.name}").qposadr[0] for joint in panda.JOINTS]
+    for angles in np.random.default_rng(0).uniform(panda.JOINT_LOW, panda.JOINT_HIGH, (50, 7)):
+        data.qpos[arm] = angles
+        mujoco.mj_forward(model, data)
+        rotation = data.site_xmat[tool].reshape(3, 3)
+        assert np.allclose(data.cam_xpos[camera], data.site_xpos[tool] + rotation @ place, atol=1e-12)
+        assert np.allclose(data.cam_xmat[camera].reshape(3, 3), rotation @ turn, atol=1e-12)
+    assert model.cam_fovy[camera] == WRIST.fovy
+
+
+def test_a_camera_is_mounted_on_the_world_or_the_tool():
+    with pytest.raises(ValueError, match="mount must be 'world' or 'tool', got 'hand'"):
+        Camera("side", (0.0, 0.0, 0.0), WRIST.rotation, 40.0, mount="hand")
+
+
+def test_a_camera_read_from_json_is_the_one_that_was_written():
+    again = Camera(**json.loads(json.dumps(dataclasses.asdict(WRIST))))
+    assert again == WRIST and hash(again) == hash(WRIST)
