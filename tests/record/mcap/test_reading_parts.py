@@ -4,14 +4,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from recordings import FilmEnv
 from tensordict import TensorDict
 from test_round_trip import assert_same, decision_rollouts, step_rollouts, write
 
 from worldenv_trl import keys
-from worldenv_trl.record import RolloutWriter, list_rollouts, read_attachments, read_metadata, read_rollouts
-from worldenv_trl.record.mcap import part
+from worldenv_trl.record import RolloutWriter, list_rollouts, read_attachments, read_metadata, read_rollouts, recorded
+from worldenv_trl.record.mcap import part, writer
 
 OLD = Path(__file__).parents[1] / "format_1"
+ONE_CAMERA = Path(__file__).parents[1] / "format_2"  # frames were one tensor
 
 
 def test_files_of_the_first_format_still_come_back_bit_for_bit():
@@ -22,6 +24,60 @@ def test_files_of_the_first_format_still_come_back_bit_for_bit():
     assert read_attachments(OLD / "steps.mcap") == {"a": b"xyz"}
     assert_same(read_rollouts(OLD / "decisions.mcap"), decision_rollouts([[3, 2, 0], [3, 3, 3], [1, 0, 0]]))
     assert torch.equal(read_rollouts(OLD / "steps.mcap", rollouts=[4])[keys.ACTION][0, :4], read[4][keys.ACTION][:4])
+
+
+def test_frames_of_the_second_format_come_back_as_those_of_its_one_camera():
+    written = decision_rollouts([[3, 2, 0], [3, 3, 3], [1, 0, 0]])
+    written["next", "recorded", keys.FRAMES, "image"] = written["next", keys.FRAMES, "image"]
+    assert_same(read_rollouts(ONE_CAMERA / "decisions.mcap"), written)
+    frames = read_rollouts(ONE_CAMERA / "decisions.mcap", keys=[("next", keys.FRAMES, "image")], rollouts=1)
+    assert torch.equal(frames["next", keys.FRAMES, "image"][0], written["next", keys.FRAMES, "image"][1])
+    with pytest.raises(ValueError, match="names several tasks and not their task_ids"):
+        read_rollouts(ONE_CAMERA / "decisions.mcap", task="goal/a")
+
+
+def test_a_recorder_s_frames_of_the_second_format_come_back_too(tmp_path):
+    torch.manual_seed(0)
+    env = recorded(FilmEnv(2), tmp_path / "a.mcap")
+    env.rollout(3)
+    env.close()
+    assert_same(read_rollouts(ONE_CAMERA / "recorder.mcap"), read_rollouts(tmp_path / "a.mcap"))
+
+
+@pytest.mark.parametrize("frames", [keys.FRAMES, None])
+def test_a_recorder_keeps_the_frames_of_every_camera_or_none(tmp_path, frames):
+    env = recorded(FilmEnv(4, ("image", "wrist_image", "left"), frames), tmp_path / "a.mcap")
+    rollouts = env.rollout(3)
+    env.close()
+    read = read_rollouts(tmp_path / "a.mcap")
+    assert set(rollouts.keys(True, True)) <= set(read.keys(True, True))
+    for key in rollouts.keys(True, True):
+        assert torch.equal(read[key], rollouts[key]), key
+    assert [each.start for each in list_rollouts(tmp_path / "a.mcap")][1] == 1001 / 20
+
+
+def test_an_image_that_stops_being_the_last_frame_of_its_camera_is_an_error(tmp_path):
+    class Torn(FilmEnv):
+        def _step(self, tensordict):
+            out = super()._step(tensordict)
+            out["observation", "left"] += tensordict[keys.STEP_MASK].any().to(torch.uint8)
+            return out
+
+    env = recorded(Torn(2, ("image", "left")), tmp_path / "a.mcap")
+    with pytest.raises(
+        ValueError, match=r"'observation', 'left'\) is not the last executed one of \('frames', 'left'\)"
+    ):
+        env.rollout(4)
+        env.close()
+
+
+def test_a_recording_of_a_later_release_is_refused_by_its_version(tmp_path, monkeypatch):
+    monkeypatch.setattr(writer, "VERSION", writer.VERSION + 1)
+    write(tmp_path / "a.mcap", decision_rollouts([[3]]))
+    with pytest.raises(
+        ValueError, match=f"format version {writer.VERSION}, .* reads up to {writer.VERSION - 1}: update"
+    ):
+        read_rollouts(tmp_path / "a.mcap")
 
 
 def test_rollouts_are_chosen_by_number_through_all_files(tmp_path):

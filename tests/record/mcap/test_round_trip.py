@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from mcap.reader import make_reader
 from tensordict import NonTensorData, NonTensorStack, TensorDict
 
 from worldenv_trl import keys
-from worldenv_trl.record import RolloutWriter, read_attachments, read_metadata, read_rollouts
+from worldenv_trl.record import RolloutWriter, list_rollouts, read_attachments, read_metadata, read_rollouts
 
 SIZE = 16
 
@@ -62,36 +63,33 @@ def step_rollouts(lengths: list[int], steps: int = 6, seed: int = 0, task: int =
     )
 
 
-def decision_rollouts(executed: list[list[int]], chunk: int = 3, seed: int = 1) -> TensorDict:
-    """Rollouts [R, D] of chunks with their frames; the next image is the last executed frame."""
-    generator = torch.Generator().manual_seed(seed)
+def decision_rollouts(
+    executed: list[list[int]], chunk: int = 3, seed: int = 1, cameras: Sequence[str] = ("image",)
+) -> TensorDict:
+    """Rollouts [R, D] of chunks with each camera's frames; its next image is the last executed frame."""
     counts = torch.tensor(executed)
     rows, decisions = counts.shape
-    frames = torch.randint(0, 256, (rows, decisions, chunk, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
     mask = torch.arange(chunk) < counts.unsqueeze(-1)
     row, decision = torch.meshgrid(torch.arange(rows), torch.arange(decisions), indexing="ij")
-    after = frames[row, decision, (counts - 1).clamp(min=0)]
 
     def before(values: torch.Tensor, first: torch.Tensor) -> torch.Tensor:
         return torch.cat([first, values[:, :-1]], 1)
 
-    start = torch.randint(0, 256, (rows, 1, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
-    return TensorDict(
-        {
-            "observation": {"image": before(after, start)},
-            keys.FRAMES: before(frames, torch.zeros_like(frames[:, :1])),
-            keys.STEP_MASK: before(mask, torch.zeros_like(mask[:, :1])),
-            keys.CHUNK: torch.randn(rows, decisions, chunk, 7, generator=generator),
-            keys.MASK: counts > 0,
-            "next": {
-                "observation": {"image": after},
-                keys.FRAMES: frames,
-                keys.STEP_MASK: mask,
-                "reward": torch.randn(rows, decisions, 1, generator=generator),
-            },
-        },
-        batch_size=[rows, decisions],
-    )
+    out = TensorDict({keys.STEP_MASK: before(mask, torch.zeros_like(mask[:, :1])), keys.MASK: counts > 0})
+    out["next", keys.STEP_MASK] = mask
+    for place, camera in enumerate(cameras):
+        generator = torch.Generator().manual_seed(seed + 100 * place)
+        frames = torch.randint(0, 256, (rows, decisions, chunk, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
+        start = torch.randint(0, 256, (rows, 1, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
+        after = frames[row, decision, (counts - 1).clamp(min=0)]
+        out["observation", camera], out["next", "observation", camera] = before(after, start), after
+        out[keys.FRAMES, camera] = before(frames, torch.zeros_like(frames[:, :1]))
+        out["next", keys.FRAMES, camera] = frames
+        if not place:
+            out[keys.CHUNK] = torch.randn(rows, decisions, chunk, 7, generator=generator)
+            out["next", "reward"] = torch.randn(rows, decisions, 1, generator=generator)
+    out.batch_size = [rows, decisions]
+    return out
 
 
 def assert_same(read: TensorDict, written: TensorDict) -> None:
@@ -136,12 +134,42 @@ def test_decisions_come_back_bit_for_bit_with_a_stop_inside_a_chunk(tmp_path):
     assert_same(read_rollouts(tmp_path / "a.mcap"), rollouts)
 
 
+def test_the_frames_of_two_cameras_come_back_bit_for_bit(tmp_path):
+    rollouts = decision_rollouts([[3, 2, 0], [3, 3, 3], [1, 0, 0]], cameras=("image", "wrist_image"))
+    write(tmp_path / "a.mcap", rollouts)
+    assert_same(read_rollouts(tmp_path / "a.mcap"), rollouts)
+    wrist = [("next", keys.FRAMES, "wrist_image"), keys.WRIST_IMAGE]
+    assert_same(read_rollouts(tmp_path / "a.mcap", keys=wrist), rollouts.select(*wrist, keys.MASK))
+    both = read_rollouts(tmp_path / "a.mcap", keys=[keys.FRAMES])
+    assert_same(both, rollouts.select(keys.FRAMES, keys.MASK))
+
+
+def test_a_camera_whose_image_is_no_frame_leaves_the_other_as_it_is(tmp_path):
+    rollouts = decision_rollouts([[3, 2], [3, 3]], cameras=("image", "left"))
+    rollouts["next", "observation", "left"] = 255 - rollouts["next", "observation", "left"]
+    write(tmp_path / "a.mcap", rollouts)
+    assert_same(read_rollouts(tmp_path / "a.mcap"), rollouts)
+    found = topics(tmp_path / "a.mcap")
+    assert found["/observation/image"] == 2 + 11 and found["/frames/left"] == 12
+
+
+def test_decisions_without_frames_come_back_and_play_as_long(tmp_path):
+    rollouts = decision_rollouts([[3, 2], [3, 3]])
+    write(tmp_path / "with.mcap", rollouts)
+    bare = rollouts.exclude(keys.FRAMES, ("next", keys.FRAMES))
+    write(tmp_path / "without.mcap", bare)
+    assert_same(read_rollouts(tmp_path / "without.mcap"), bare)
+    starts = [[each.start for each in list_rollouts(tmp_path / f"{name}.mcap")] for name in ("with", "without")]
+    assert starts[0] == starts[1]
+
+
 def test_an_image_is_stored_once(tmp_path):
     write(tmp_path / "steps.mcap", step_rollouts([6, 3]))
     assert topics(tmp_path / "steps.mcap")["/observation/image"] == 7 + 4
-    write(tmp_path / "decisions.mcap", decision_rollouts([[3, 2]]))
+    write(tmp_path / "decisions.mcap", decision_rollouts([[3, 2]], cameras=("image", "wrist_image")))
     found = topics(tmp_path / "decisions.mcap")
-    assert found["/observation/image"] == 1 + 5 and found["/observation/image/after_stop"] == 1
+    for name in ("image", "wrist_image"):
+        assert found[f"/observation/{name}"] == 1 + 5 and found[f"/observation/{name}/after_stop"] == 1
 
 
 def test_root_and_next_values_that_differ_are_both_stored(tmp_path):
@@ -156,7 +184,7 @@ def test_root_and_next_values_that_differ_are_both_stored(tmp_path):
 def test_decisions_whose_image_is_no_frame_come_back_too(tmp_path):
     rollouts = decision_rollouts([[3, 2], [3, 3]])
     rollouts["next", "observation", "image"] = 255 - rollouts["next", "observation", "image"]
-    rollouts[keys.FRAMES] = rollouts[keys.FRAMES] + 1
+    rollouts[keys.FRAMES, "image"] = rollouts[keys.FRAMES, "image"] + 1
     write(tmp_path / "a.mcap", rollouts)
     assert_same(read_rollouts(tmp_path / "a.mcap"), rollouts)
 
@@ -234,17 +262,25 @@ def test_metadata_and_attachments_come_before_the_rollouts(tmp_path):
 
 
 def test_a_task_selects_its_rollouts(tmp_path):
-    tasks = ["starter/open_the_top_drawer", "starter/turn_on_the_stove"]
-    from worldenv_trl.scenes import load_task
-
-    parts = [step_rollouts([6, 3], seed=i, task=load_task(name).task_id) for i, name in enumerate(tasks)]
+    tasks = ["goal/a", "goal/b"]
+    parts = [step_rollouts([6, 3], seed=task, task=task) for task in range(2)]
     write(tmp_path / "a.mcap", *parts, metadata={"tasks": tasks})
     assert_same(read_rollouts(tmp_path / "a.mcap", task=tasks[1]), parts[1])
-    with pytest.raises(ValueError, match=r"a\.mcap is of starter/open_the_top_drawer, .*not of starter/put"):
-        read_rollouts(tmp_path / "a.mcap", task="starter/put_the_bowl_on_the_plate")
+    with pytest.raises(ValueError, match=r"a\.mcap is of goal/a, goal/b, not of goal/c"):
+        read_rollouts(tmp_path / "a.mcap", task="goal/c")
     write(tmp_path / "b.mcap", parts[0])
     with pytest.raises(ValueError, match="does not say of which tasks"):
         read_rollouts(tmp_path / "b.mcap", task=tasks[0])
+
+
+def test_a_task_is_found_by_what_each_file_calls_it(tmp_path):
+    first, second = step_rollouts([6, 3], task=7), step_rollouts([4, 2], seed=1, task=3)
+    write(tmp_path / "a.mcap", first, second, metadata={"tasks": ["goal/a", "goal/b"], "task_ids": [7, 3]})
+    write(tmp_path / "b.mcap", second, first, metadata={"tasks": ["goal/b", "goal/a"], "task_ids": [7, 3]})
+    assert_same(read_rollouts(tmp_path, task="goal/a"), torch.cat([first, second]))
+    bare = [keys.ACTION]
+    assert_same(read_rollouts(tmp_path, task="goal/b", keys=bare), torch.cat([second, first]).select(*bare, keys.MASK))
+    assert_same(read_rollouts(tmp_path / "a.mcap", task="goal/b", rollouts=[0, 3]), second[1:])
 
 
 def test_messages_are_typed_and_images_viewable(tmp_path):

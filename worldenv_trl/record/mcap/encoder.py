@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from torch import Tensor
 
-from worldenv_trl.keys import CONTROL_HZ, FRAMES, STATE, STEP_MASK
+from worldenv_trl.keys import CONTROL_HZ, STATE, STEP_MASK
 from worldenv_trl.record.mcap.file import McapFile
 from worldenv_trl.record.mcap.layout import Entry, Layout, to_bytes
 from worldenv_trl.record.mcap.messages import (
@@ -68,8 +68,7 @@ class RolloutEncoder:
             if entry.stored == "root":
                 self._images(entry, values[entry.key], before, numbers)
             elif entry.stored != "last_of_frames":
-                split = entry.key == (FRAMES,) and self.layout.splits_frames
-                executed = values["next", STEP_MASK].sum(-1).numpy() if split else None
+                executed = values["next", STEP_MASK].sum(-1).numpy() if self.layout.splits(entry) else None
                 self._images(entry, values["next", *entry.key], before + PERIOD_NS, numbers, executed)
         state = values.get(("next", *STATE))
         if state is not None and state.shape[-1] == 7:

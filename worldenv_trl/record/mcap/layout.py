@@ -11,10 +11,10 @@ import torch
 from tensordict import TensorDictBase, is_non_tensor
 from torch import Tensor
 
-from worldenv_trl.keys import FRAMES, IMAGE, MASK, STEP_MASK
+from worldenv_trl.keys import FRAMES, MASK, STEP_MASK
 from worldenv_trl.record.mcap.protobuf import FixedMessage, MessageField
 
-__all__ = ["Entry", "Layout", "executed_entries", "from_bytes", "leaves", "to_bytes"]
+__all__ = ["Entry", "Layout", "executed_entries", "from_bytes", "leaves", "same_camera", "to_bytes"]
 
 _TOPICS = ("step", "reset", "hand", "instruction")  # that are no images
 _INDEX_FIELDS = [MessageField("rollout", torch.int64, 1), MessageField("step", torch.int64, 1)]
@@ -27,7 +27,7 @@ class Entry:
     ``stored`` is ``root`` or ``next`` for an entry kept at every step, ``chained`` when the root value of each step is
     the next value of the step before: then the first root value and all next values are kept. Images have further
     ways: ``chained_from_zero`` (the first root value is all zero and not kept) and ``last_of_frames`` (every next value
-    is the last executed one of ``frames``: only the first root value is kept).
+    is the last executed one of its camera's ``frames``: only the first root value is kept).
     """
 
     key: tuple[str, ...]
@@ -90,6 +90,7 @@ class Layout:
                 (images if _is_image(own) else numbers).append(each)
         images = _name_images(images, flat, valid) if count else images
         decisions = [e.shape[0] for e in images if len(e.shape) == 4]
+        decisions += [e.shape[0] for e in numbers if e.key == (STEP_MASK,) and e.stored != "root" and e.shape]
         return cls(tuple(images), _name_fields(numbers), tuple(sorted(texts)), max(decisions, default=1))
 
     def step_message(self) -> FixedMessage:
@@ -105,21 +106,37 @@ class Layout:
         found = (e for e in (*self.images, *self.numbers) if e.key == key and (not stored or e.stored in stored))
         return next(found, None)
 
+    def splits(self, entry: Entry) -> bool:
+        """Whether ``entry`` is frames of which those past a stop inside a chunk go to a topic of their own."""
+        image = same_camera(entry.key) if entry.key[0] == FRAMES else None
+        return image is not None and self.entry(image, "last_of_frames") is not None
+
     @property
     def splits_frames(self) -> bool:
-        """Whether frames past a stop inside a chunk go to a topic of their own."""
-        return self.entry(IMAGE, "last_of_frames") is not None
+        """Whether it does so for any camera."""
+        return any(entry.stored == "last_of_frames" for entry in self.images)
 
     def to_json(self) -> dict:
         return asdict(self)
 
     @classmethod
-    def from_json(cls, value: dict) -> Layout:
+    def from_json(cls, value: dict, one_camera: bool = False) -> Layout:
+        """The layout that :meth:`to_json` described; ``one_camera``: by a release whose frames were one tensor."""
+
         def entries(rows: list[dict]) -> tuple[Entry, ...]:
-            return tuple(Entry(**row | {"key": tuple(row["key"]), "shape": tuple(row["shape"])}) for row in rows)
+            return tuple(Entry(**row | {"key": key(row["key"]), "shape": tuple(row["shape"])}) for row in rows)
+
+        def key(path: list[str]) -> tuple[str, ...]:
+            return (*path, "image") if one_camera and path in ([FRAMES], ["recorded", FRAMES]) else tuple(path)
 
         texts = tuple(tuple(path) for path in value["texts"])
         return cls(entries(value["images"]), entries(value["numbers"]), texts, int(value["steps_per_entry"]))
+
+
+def same_camera(key: tuple[str, ...]) -> tuple[str, ...] | None:
+    """``("frames", entry)`` for ``("observation", entry)`` and the other way round; None for any other entry."""
+    other = {"observation": FRAMES, FRAMES: "observation"}.get(key[0])
+    return (other, key[1]) if other is not None and len(key) == 2 else None
 
 
 def leaves(rollouts: TensorDictBase) -> tuple[dict[tuple[str, ...], Tensor], dict[tuple[str, ...], list]]:
@@ -222,37 +239,45 @@ def _is_chained(root: Tensor, after: Tensor, valid: Tensor) -> bool:
 
 def _name_images(images: list[Entry], flat: dict[tuple[str, ...], Tensor], valid: Tensor) -> list[Entry]:
     """Decides how the images of decisions are kept, and their topics."""
-    by_key = {entry.key: entry for entry in images if entry.stored == "chained"}
-    image_key, frames_key = IMAGE, (FRAMES,)
-    joined = image_key in by_key and frames_key in by_key and ("next", STEP_MASK) in flat
-    joined = joined and _last_frames_match(flat, valid)
+    chained = {entry.key for entry in images if entry.stored == "chained"}
+    pairs = {key: same_camera(key) for key in chained if key[0] != FRAMES and same_camera(key) in chained}
+    image_of = {frames: key for key, frames in pairs.items() if _last_frames_match(flat, valid, key, frames)}
     named = []
     for entry in images:
         topic = "/" + "/".join(entry.key)
         if entry.stored == "root" and any(e.key == entry.key and e.stored == "next" for e in images):
             topic = "/root" + topic
         # Before the first decision there are no frames; any other first image may be black by chance.
-        if entry.stored == "chained" and entry.key == frames_key and not bool(flat[entry.key][:, 0].any()):
+        frames = entry.stored == "chained" and entry.key[0] == FRAMES
+        if frames and not bool(flat[entry.key][:, 0].any()):
             entry = _replace(entry, stored="chained_from_zero")
-        if joined and entry.key == image_key:
+        if entry.key in image_of.values():
             entry = _replace(entry, stored="last_of_frames")
-        if joined and entry.key == frames_key:
-            topic = "/" + "/".join(image_key)  # the reset image, then all frames: one video
+        if entry.key in image_of:
+            topic = "/" + "/".join(image_of[entry.key])  # the reset image, then all frames: one video
         named.append(_replace(entry, topic=topic))
     # The reset image comes before the frames on their common topic.
     return sorted(named, key=lambda e: e.stored != "last_of_frames")
 
 
-def _last_frames_match(flat: dict[tuple[str, ...], Tensor], valid: Tensor) -> bool:
+def _last_frames_match(
+    flat: dict[tuple[str, ...], Tensor], valid: Tensor, image: tuple[str, ...], frames: tuple[str, ...]
+) -> bool:
     """Whether every next image is the last executed one of the decision's frames."""
-    mask = flat["next", STEP_MASK]
-    if bool((mask[..., 1:] & ~mask[..., :-1]).any()):
+    mask = flat.get(("next", STEP_MASK))
+    if mask is None or bool((mask[..., 1:] & ~mask[..., :-1]).any()):
         return False
+    shown, video = flat["next", *image], flat["next", *frames]
     rows, steps = valid.nonzero(as_tuple=True)
     last = mask[rows, steps].sum(-1) - 1
-    if not len(rows) or bool((last < 0).any()):
+    if (
+        video.shape[2:3] != mask.shape[2:]
+        or video.shape[3:] != shown.shape[2:]
+        or not len(rows)
+        or bool((last < 0).any())
+    ):
         return False
-    return bool((flat["next", FRAMES][rows, steps, last] == flat["next", *IMAGE][rows, steps]).all())
+    return bool((video[rows, steps, last] == shown[rows, steps]).all())
 
 
 def _name_fields(numbers: list[Entry]) -> tuple[Entry, ...]:

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from worldenv_trl.keys import FRAMES, IMAGE, STEP_MASK
+from worldenv_trl.keys import STEP_MASK
 from worldenv_trl.record.mcap.encoder import PERIOD_NS
-from worldenv_trl.record.mcap.layout import Entry, Layout, from_bytes
+from worldenv_trl.record.mcap.layout import Entry, Layout, from_bytes, same_camera
 from worldenv_trl.record.mcap.messages import image_head
 from worldenv_trl.record.mcap.protobuf import image_data
 
@@ -59,7 +59,7 @@ class Part:
         return len(self.lengths)
 
     def select(self, keep: list[int]) -> Part:
-        """The rollouts with these places, as one flat batch."""
+        """The rollouts with these places, with what is decoded of them, as one flat batch."""
         pick = lambda values: [values[index] for index in keep]  # noqa: E731
         return Part(
             self.layout,
@@ -72,6 +72,7 @@ class Part:
             [(path, pick(words)) for path, words in self.texts],
             None if self.executed is None else pick(self.executed),
             self.file,
+            {key: value[keep] for key, value in self.values.items()},
         )
 
     def decode(self, found: dict[int, Found], complete: bool, wanted: Callable[[_Path], bool]) -> None:
@@ -156,7 +157,7 @@ class Part:
     # --------------------------------------------------------------------------------------------- images
 
     def _needed(self, entry: Entry, wanted: Callable[[_Path], bool]) -> bool:
-        return wanted(entry.key) or (entry.key == (FRAMES,) and self.layout.splits_frames and wanted(IMAGE))
+        return wanted(entry.key) or (self.layout.splits(entry) and wanted(same_camera(entry.key)))
 
     def _decode_images(self, topic: str, rollouts: list[Found], have: list[int], complete: bool) -> None:
         entries = [e for e in self.layout.images if e.topic == topic]
@@ -197,7 +198,7 @@ class Part:
                     continue
                 images = _each(buffer[row, step + int(entry.chained)])
                 executed = len(images)
-                if entry.key == (FRAMES,) and self.layout.splits_frames:
+                if self.layout.splits(entry):
                     executed = self._executed(row, step)
                 first = time + (0 if entry.stored == "root" else PERIOD_NS)
                 for place, image in enumerate(images):
@@ -212,7 +213,8 @@ class Part:
         return next(v for key, v in self.values.items() if key[1:] == (STEP_MASK,) and key[0] != "root")
 
     def _fill_last(self, entry: Entry, have: list[int]) -> None:
-        frames = next(v for key, v in self.values.items() if key[1:] == (FRAMES,) and key[0] != "root")
+        path = same_camera(entry.key)
+        frames = next(v for key, v in self.values.items() if key[1:] == path and key[0] != "root")
         mask, out = self._step_mask(), self.values[(entry.stored, *entry.key)]
         for row, length in enumerate(have):
             last = mask[row, -self.steps :][:length].sum(-1) - 1

@@ -51,11 +51,12 @@ def read_rollouts(
         path: file, folder (its ``*.mcap``, by name) or pattern.
 
     Keyword Args:
-        task: only rollouts of this task.
+        task: only rollouts of this task, by its name in the metadata of each file.
         rollouts: only these, counted through all files; they come in the order of the files, each once.
         time: only rollouts that play between these seconds of their file, as a viewer's time line shows them.
         steps: only this part of each rollout.
-        keys: only these entries, named as in the TensorDict; the others are not decoded.
+        keys: only these entries, named as in the TensorDict; the others are not decoded. The name of a nest, such as
+            ``"frames"``, is all in it.
         replays: of a folder, also what :func:`~worldenv_trl.record.replay` has written (``replay`` in its metadata).
 
     Returns:
@@ -73,20 +74,19 @@ def read_rollouts(
     if task is not None:
         for recording in recordings:
             _require_task(recording.path, recording.metadata, task)
-    several = task is not None and (len(recordings) > 1 or len(_tasks(recordings[0].metadata)) > 1)
-    wanted = _wanted(keys, several)
     chosen = _chosen(recordings, rollouts, path)
     parts: list[Part] = []
     for number, recording in enumerate(recordings):
+        task_id = None if task is None else _task_id(recording, task)
         keep = _keep(None if chosen is None else chosen[number], time)
         if chosen is None or chosen[number]:
-            parts += _read(recording, keep, wanted)
+            found = _read(recording, keep, _wanted(keys, task_id is not None))
+            parts += found if task_id is None else _of_task(found, task_id, recording.path)
     if not parts:
         lost = [recording.warning([], 0) for recording in recordings if not recording.scan.intact]
-        asked = "" if rollouts is time is None else " that were asked for"
+        asked = f" of {task}" if task is not None else "" if rollouts is time is None else " that were asked for"
         raise ValueError(f"{path} holds no rollouts{asked}{': ' + lost[0] if lost else ''}")
     out = _join(parts, path)
-    out = _of_task(out, task, path) if several else out
     if steps is not None:
         out = out[..., steps]
     return out if keys is None else _selected(out, keys, recordings, path)
@@ -130,11 +130,12 @@ def _read(recording: Recording, keep: Callable | None, wanted: Callable[[_Path],
     return parts
 
 
-def _wanted(keys: Sequence[_Key] | None, several: bool) -> Callable[[_Path], bool]:
+def _wanted(keys: Sequence[_Key] | None, task_id: bool) -> Callable[[_Path], bool]:
     if keys is None:
         return lambda _: True
     paths = {_path(key)[1:] if _path(key)[0] == "next" else _path(key) for key in keys}
-    return lambda path: path in paths or (several and path == (TASK_ID,))
+    paths |= {(TASK_ID,)} if task_id else set()
+    return lambda path: any(path[:length] in paths for length in range(1, len(path) + 1))
 
 
 def _path(key: _Key) -> _Path:
@@ -174,7 +175,7 @@ def _keep(numbers: set[int] | None, time: tuple[float, float] | None) -> Callabl
 
 
 def _selected(rollouts: TensorDict, keys: Sequence[_Key], recordings: list[Recording], path) -> TensorDict:
-    have = set(rollouts.keys(True, True))
+    have = set(rollouts.keys(True))
     missing = [key for key in keys if (_path(key)[0] if len(_path(key)) == 1 else _path(key)) not in have]
     if missing:
         known = {"/".join(each): each[0] if len(each) == 1 else each for r in recordings for each in r.entries()}
@@ -311,12 +312,23 @@ def _require_task(path: Path, metadata: dict[str, Any], task: str) -> None:
         raise ValueError(f"{path} is of {', '.join(tasks)}, not of {task}")
 
 
-def _of_task(rollouts: TensorDict, task: str, path: str | os.PathLike) -> TensorDict:
-    from worldenv_trl.scenes import load_task  # builds on MuJoCo; reading alone does not need it
+def _task_id(recording: Recording, task: str) -> int | None:
+    """The ``task_id`` of ``task`` in a file of several tasks; None if all its rollouts are of it."""
+    tasks = _tasks(recording.metadata)
+    if len(tasks) < 2:
+        return None
+    numbers = recording.metadata.get("task_ids")
+    if numbers is None and recording.version < 3:
+        raise ValueError(f"{recording.path} names several tasks and not their task_ids: they cannot be told apart")
+    return tasks.index(task) if numbers is None else int(numbers[tasks.index(task)])
 
-    if TASK_ID not in rollouts.keys():  # noqa: SIM118 - a TensorDict iterates over rows
-        raise ValueError(f"{path} holds several tasks and no {TASK_ID!r}: its rollouts of {task} cannot be told apart")
-    chosen = rollouts[TASK_ID][..., 0, 0] == load_task(task).task_id
-    if not bool(chosen.any()):
-        raise ValueError(f"{path} holds no rollout of {task}")
-    return rollouts[chosen] if chosen.ndim == 1 else rollouts.reshape(-1, rollouts.shape[-1])[chosen.flatten()]
+
+def _of_task(parts: list[Part], task_id: int, path: Path) -> list[Part]:
+    """The rollouts of these decoded parts that have that ``task_id``."""
+    kept = []
+    for part in parts:
+        numbers = next((value for key, value in part.values.items() if key[1:] == (TASK_ID,)), None)
+        if numbers is None:
+            raise ValueError(f"{path} holds several tasks and no {TASK_ID!r}: its rollouts cannot be told apart")
+        kept.append(part.select((numbers[:, 0, 0] == task_id).nonzero().flatten().tolist()))
+    return [part for part in kept if part.rows]

@@ -57,8 +57,9 @@ class Recording:
         self.path, self.scan = path, McapScan(path)
         records = self.scan.metadata
         version = next((record.metadata.get("version", "0") for record in records if record.name == FORMAT), None)
-        if version is None and any(record.name.startswith(f"{FORMAT}.") for record in records):
-            version = str(VERSION)  # its record was lost
+        lost = version is None and any(record.name.startswith(f"{FORMAT}.") for record in records)
+        if lost:
+            version = str(VERSION)
         if version is None:
             if not self.scan.intact:
                 raise ValueError(f"{path} holds no worldenv_trl rollouts any more: it {self.scan.losses[0]}")
@@ -68,6 +69,7 @@ class Recording:
             raise ValueError(
                 f"{path} has format version {version}, this release reads up to {VERSION}: update worldenv_trl"
             )
+        self._one_camera = lost or self.version < 3  # frames were one tensor
         self.metadata: dict[str, Any] = {}
         self.written: list[Part] = []
         self.streams: list[tuple[Layout, str]] = []
@@ -90,11 +92,11 @@ class Recording:
         try:
             value = json.loads(record.metadata["json"])
             if kind == "layout":
-                self._layouts.append(Layout.from_json(value))
+                self._layouts.append(Layout.from_json(value, self._one_camera))
             elif kind == "write":
                 self._note_write(value)
             elif kind == "stream":
-                self.streams.append((Layout.from_json(value["layout"]), value["prefix"]))
+                self.streams.append((Layout.from_json(value["layout"], self._one_camera), value["prefix"]))
             elif kind == "lengths":
                 self._lengths = list(value)
             elif kind == "texts":

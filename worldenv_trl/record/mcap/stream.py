@@ -19,8 +19,6 @@ from torch import Tensor
 from worldenv_trl.keys import (
     ACTION,
     ACTION_MAP,
-    FRAMES,
-    IMAGE,
     INSTRUCTION,
     KINEMATIC_STATE,
     NUM_STEPS,
@@ -36,7 +34,7 @@ from worldenv_trl.keys import (
 from worldenv_trl.record.mcap.annotations import Annotator
 from worldenv_trl.record.mcap.encoder import PERIOD_NS, RolloutEncoder
 from worldenv_trl.record.mcap.file import FLUSH_SECONDS
-from worldenv_trl.record.mcap.layout import Layout
+from worldenv_trl.record.mcap.layout import Layout, same_camera
 from worldenv_trl.record.mcap.recording import TEXT
 from worldenv_trl.record.mcap.writer import FORMAT, open_file
 
@@ -328,9 +326,10 @@ class RolloutStream:
                 raise ValueError(f"entry {key} {found}, it was {entry.dtype} {list(entry.shape)} when recording began")
             if entry.stored == "last_of_frames":
                 last = (values["next", STEP_MASK].sum(-1) - 1).clamp(min=0)
-                shown = values["next", FRAMES][torch.arange(len(last)), last]
-                if not torch.equal(shown, values["next", *IMAGE]):
-                    raise ValueError(f"entry {key} is not the last executed one of {FRAMES!r}, as it was at first")
+                frames = same_camera(entry.key)
+                shown = values["next", *frames][torch.arange(len(last)), last]
+                if not torch.equal(shown, values[key]):
+                    raise ValueError(f"entry {key} is not the last executed one of {frames}, as it was at first")
 
     def _report(self, values: dict[_Path, Tensor], numbers: list[int]) -> None:
         """A line of text for each rollout that has ended."""

@@ -20,7 +20,7 @@ from worldenv_trl.record.mcap.layout import Layout, executed_entries, leaves
 
 __all__ = ["FORMAT", "VERSION", "RolloutWriter", "open_file"]
 
-FORMAT, VERSION = "worldenv_trl.rollouts", 2
+FORMAT, VERSION = "worldenv_trl.rollouts", 3  # 3: frames by camera
 _FIRST_GUESS = 0.5  # compressed size over raw size, before anything was measured
 _MEASURED = 16 * 2**20  # bytes
 _STEPS_AT_ONCE = 8  # of a file that is cut off, so many may be lost
@@ -56,10 +56,11 @@ def open_file(
 class RolloutWriter:
     """Writes TorchRL rollouts to one MCAP file that Foxglove and Rerun open and :func:`read_rollouts` reads back.
 
-    Rollouts follow each other in time at 20 steps a second: images as ``foxglove.RawImage`` on ``/observation/image``,
-    one ``worldenv_trl.Step`` message per entry on ``/step`` (a field per key, so they can be plotted), the first values
-    on ``/reset``, the hand as ``PoseInFrame`` on ``/hand``, the instruction as ``Log`` on ``/instruction``. Everything
-    needed to rebuild the TensorDict is metadata written before the messages.
+    Rollouts follow each other in time at 20 steps a second: each camera's images, with every frame that its decisions
+    produced, as ``foxglove.RawImage`` on ``/observation/<entry>``, one ``worldenv_trl.Step`` message per entry on
+    ``/step`` (a field per key, so they can be plotted), the first values on ``/reset``, the hand as ``PoseInFrame`` on
+    ``/hand``, the instruction as ``Log`` on ``/instruction``. Everything needed to rebuild the TensorDict is metadata
+    written before the messages.
 
     The file appears under its name when the writer is closed. Until then, and after an exception, what was written is
     in ``<name>.partial.mcap``, which :func:`read_rollouts` opens when named. What :meth:`write` has written when it
@@ -70,8 +71,9 @@ class RolloutWriter:
 
     Keyword Args:
         metadata: plain values (strings, numbers, lists, dicts), for instance ``{"tasks": [...], "seed": 0}``. ``task``
-            or ``tasks`` names the tasks for ``read_rollouts(path, task=...)``. :func:`~worldenv_trl.record.provenance`
-            makes metadata and attachments of env, models, settings and versions.
+            or ``tasks`` names the tasks for ``read_rollouts(path, task=...)``, ``task_ids`` their numbers in
+            ``task_id`` where these are not 0, 1, ... :func:`~worldenv_trl.record.provenance` makes metadata and
+            attachments of env, models, settings and versions.
         attachments: name -> bytes, text or the path of a file.
         overwrite: replace an existing file, or an unfinished one of that name.
 
