@@ -23,7 +23,7 @@ from command_line import one_line_errors
 from worldenv_trl.policies import OFTPolicy, laplace_actor
 from worldenv_trl.pretrained import CONFIG_NAME
 from worldenv_trl.record import model_hash, parse_edit, read_metadata, replay
-from worldenv_trl.record.replay_source import open_rollout
+from worldenv_trl.record.replay.source import open_rollout
 from worldenv_trl.reflectors import CompactReflector
 from worldenv_trl.world_models import VideoWorldModel
 
