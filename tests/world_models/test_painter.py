@@ -15,7 +15,7 @@ def test_a_pixel_at_the_tool_can_follow_the_tool_exactly():
 
 
 def paint(bias: torch.Tensor | None = None, motion: float = 0.0, chunk: int = 2) -> tuple[torch.Tensor, torch.Tensor]:
-    """Frames [1, C, 3, 32, 32] of a painter that listens to its ``bias`` [10] alone, and its memory [1, 3, 3, 32, 32]."""
+    """Frames [1, C, 3, H, W] of a painter that listens to its ``bias`` [10] alone, and its memory [1, 3, 3, H, W]."""
     painter = Painter(32, 2, 8, 8)
     if bias is not None:
         painter.paint.bias.data = bias.repeat_interleave(4)
