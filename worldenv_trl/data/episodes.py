@@ -179,7 +179,7 @@ class Episodes:
         parts = [part for part in parts if len(part)]
         if not parts:
             raise ValueError("there are no episodes to put together")
-        _check_alike(parts)
+        check_alike(parts)
         texts = [text for part in parts for text in part.instructions]
         out = Episodes.__new__(Episodes)
         out.entries, out.instructions = concatenated([part.entries for part in parts]), texts
@@ -204,7 +204,8 @@ def _same_store(first: TensorDictBase, second: TensorDictBase) -> bool:
     return mine.keys() == other.keys() and all(value is other[key] for key, value in mine.items())
 
 
-def _check_alike(parts: Sequence[Episodes]) -> None:
+def check_alike(parts: Sequence[Episodes]) -> None:
+    """Raises ``ValueError`` for sets with other entries, cameras or image sizes than the first one's."""
     first = parts[0]
     for part in parts[1:]:
         if set(part.entries.keys()) != set(first.entries.keys()):
