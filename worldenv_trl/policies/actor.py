@@ -23,6 +23,10 @@ Bound = float | Sequence[float]
 class _Scale(nn.Module):
     """From what a policy writes to what is sampled from: ``scale = exp(clamp(log_scale)) * scale_factor``."""
 
+    log_scale_low: Tensor | None
+    log_scale_high: Tensor | None
+    scale_factor: Tensor
+
     def __init__(self, scale_factor: float, log_scale_bounds: tuple[Tensor, Tensor] | None) -> None:
         super().__init__()
         low, high = (None, None) if log_scale_bounds is None else log_scale_bounds
@@ -139,12 +143,13 @@ def laplace_actor(
     if not isinstance(policy, Policy):
         raise TypeError(f"policy must be a worldenv_trl.policies.Policy, got {type(policy).__name__}")
     scale_factor = _positive(scale_factor)
+    bounds = None
     if log_scale_bounds is not None:
         low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in log_scale_bounds)
         if not (low < high).all():
             raise ValueError(f"log_scale_bounds must be (low, high) with low < high, got {log_scale_bounds}")
-        log_scale_bounds = (low, high)
-    scale = _Scale(scale_factor, log_scale_bounds).to(policy.action_range.device)
+        bounds = (low, high)
+    scale = _Scale(scale_factor, bounds).to(policy.action_range.device)
     module = TensorDictSequential(
         policy, TensorDictModule(scale, in_keys=[LOC, LOG_SCALE], out_keys=[loc_key, scale_key])
     )

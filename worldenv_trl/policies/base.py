@@ -24,7 +24,7 @@ class Policy(TensorDictModuleBase, abc.ABC):
     and ``("vla_action", "log_scale")``, float32 [*B, C, 7] in the env's normalised action units.
 
     A subclass calls ``super().__init__`` with what it is trained for, and implements :meth:`predict`,
-    :meth:`fit_statistics`, :attr:`action_range`, :meth:`scale_parameters` and :meth:`post_training_parameters`. With
+    :meth:`fit_statistics`, :meth:`scale_parameters` and :meth:`post_training_parameters`. With
     :class:`~worldenv_trl.pretrained.Pretrained` beside it and the settings in its config, all of that is saved with its
     weights, and :func:`~worldenv_trl.policies.check_pairing` holds an env against it.
 
@@ -35,10 +35,16 @@ class Policy(TensorDictModuleBase, abc.ABC):
         proprio: what the state tells, ``commanded`` (the controller's targets) or ``measured``.
         instructions: those it is trained on; others are answered with a warning. Empty: it never warns.
 
+    Attributes:
+        action_range: half the range that the training uses of each action dimension, [7], in normalised units; a buffer
+            that is 1 until :meth:`fit_statistics` sets it.
+
     Raises:
         ValueError: for no camera, one that is named twice, a size below 1, or another kind of proprioception; when
             called, for an image that is missing, and images or states of another size.
     """
+
+    action_range: Tensor
 
     def __init__(
         self,
@@ -59,6 +65,7 @@ class Policy(TensorDictModuleBase, abc.ABC):
         self.cameras, self.image_size = tuple(cameras), int(image_size)
         self.chunk_length, self.proprio = int(chunk_length), proprio
         self.seen = SeenInstructions(f"the policy {type(self).__name__}", instructions)
+        self.register_buffer("action_range", torch.ones(ACTION_DIM))
         self.in_keys = [*(image_key(camera) for camera in self.cameras), STATE, INSTRUCTION]
         self.out_keys = [LOC, LOG_SCALE]
 
@@ -79,14 +86,9 @@ class Policy(TensorDictModuleBase, abc.ABC):
             instructions: n texts.
         """
 
-    @property
-    @abc.abstractmethod
-    def action_range(self) -> Tensor:
-        """Half the range that the training uses of each action dimension, [7], in normalised units."""
-
     @abc.abstractmethod
     def fit_statistics(self, states: Tensor, actions: Tensor) -> None:
-        """Takes what normalisation needs from training data, [..., 7] each."""
+        """Takes :attr:`action_range`, and what normalisation needs, from training data, [..., 7] each."""
 
     @abc.abstractmethod
     def scale_parameters(self) -> Iterable[nn.Parameter]:

@@ -233,12 +233,15 @@ class OFTPolicy(Policy, Pretrained):
         >>> out["vla_action", "loc"].shape, out["vla_action", "log_scale"].shape
         (torch.Size([2, 8, 7]), torch.Size([2, 8, 7]))
         >>> groups = policy.post_training_parameters(rank=4)
-        >>> {name: sum(parameter.numel() for parameter in group) for name, group in groups.items()}
-        {'adapters': 19828, 'heads': 204814}
+        >>> list(groups)
+        ['adapters', 'heads']
     """
 
     config_class = OFTConfig
     config: OFTConfig
+    state_center: Tensor
+    state_half_range: Tensor
+    action_center: Tensor
 
     def __init__(self, config: OFTConfig):
         super().__init__(
@@ -257,13 +260,8 @@ class OFTPolicy(Policy, Pretrained):
         self.register_buffer("state_center", torch.zeros(STATE_DIM))
         self.register_buffer("state_half_range", torch.ones(STATE_DIM))
         self.register_buffer("action_center", torch.zeros(ACTION_DIM))
-        self.register_buffer("action_half_range", torch.ones(ACTION_DIM))
         if config.lora_rank:
             self._inject_adapters()
-
-    @property
-    def action_range(self) -> Tensor:
-        return self.action_half_range
 
     def predict(
         self, images: Mapping[str, Tensor], state: Tensor, instructions: Sequence[str]
@@ -271,7 +269,7 @@ class OFTPolicy(Policy, Pretrained):
         words = self._words(instructions)
         pixels = [images[camera].float() / 127.5 - 1 for camera in self.cameras]
         hidden = self.backbone(pixels, (state - self.state_center) / self.state_half_range, words)  # [n, C, dim]
-        return self.loc_head(hidden) * self.action_half_range + self.action_center, self.scale_head(hidden)
+        return self.loc_head(hidden) * self.action_range + self.action_center, self.scale_head(hidden)
 
     @torch.compiler.disable  # see Policy._goals
     def _words(self, instructions: Sequence[str]) -> Tensor:
@@ -288,13 +286,16 @@ class OFTPolicy(Policy, Pretrained):
         Raises:
             ValueError: for no data, or numbers that are not finite.
         """
-        for name, values, floor in (("state", states, 0.05), ("action", actions, 0.005)):
+        for name, values, center, half_range, floor in (
+            ("states", states, self.state_center, self.state_half_range, 0.05),
+            ("actions", actions, self.action_center, self.action_range, 0.005),
+        ):
             flat = values.reshape(-1, values.shape[-1]).float()
             if flat.shape[0] == 0 or not torch.isfinite(flat).all():
-                raise ValueError(f"{name}s must hold at least one row and only finite numbers")
+                raise ValueError(f"{name} must hold at least one row and only finite numbers")
             low, high = torch.quantile(flat, torch.tensor([0.01, 0.99]).to(flat), dim=0)
-            getattr(self, f"{name}_center").copy_((low + high) / 2)
-            getattr(self, f"{name}_half_range").copy_(((high - low) / 2).clamp(min=floor))
+            center.copy_((low + high) / 2)
+            half_range.copy_(((high - low) / 2).clamp(min=floor))
 
     def scale_parameters(self) -> list[nn.Parameter]:
         return list(self.scale_head.parameters())

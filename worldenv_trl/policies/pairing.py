@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
 from worldenv_trl.keys import CHUNK, image_key
@@ -37,38 +36,29 @@ def check_pairing(policy: Policy, env: EnvBase) -> None:
             ...
         ValueError: the policy looks through 'wrist', the env shows no ('observation', 'wrist_image'): ...
     """
-    name = type(policy).__name__
     for camera in policy.cameras:
-        image = _spec(env.observation_spec, image_key(camera))
+        image = env.observation_spec.get(image_key(camera), None)
         if image is None:
             raise ValueError(
                 f"the policy looks through {camera!r}, the env shows no {image_key(camera)}: "
-                f"build the env with cameras={policy.cameras}, or train a {name} for the env's cameras"
+                f"build the env with cameras={policy.cameras}, or train a policy for the env's cameras"
             )
         size = tuple(image.shape[-2:])
         if size != (policy.image_size, policy.image_size):
             raise ValueError(
                 f"the policy was trained on images of {policy.image_size} px, those of the env's {camera!r} are "
-                f"{size[0]} x {size[1]} px: build the env with image_size={policy.image_size}, or train a {name} for it"
+                f"{size[0]} x {size[1]} px: build the env with image_size={policy.image_size}, or train a policy for it"
             )
-    chunk = _spec(env.full_action_spec, CHUNK)
+    chunk = env.full_action_spec.get(CHUNK, None)
     length = getattr(env, "chunk_length", None) if chunk is None else chunk.shape[-2]
     if length is not None and length != policy.chunk_length:
         raise ValueError(
             f"the policy writes chunks of {policy.chunk_length} actions, the env executes {length} of them a decision: "
-            f"build the env with chunk_length={policy.chunk_length}, or train a {name} with chunk_length={length}"
+            f"build the env with chunk_length={policy.chunk_length}, or train a policy with chunk_length={length}"
         )
     proprio = getattr(env, "proprio", None)
     if proprio is not None and proprio != policy.proprio:
         raise ValueError(
             f"the policy was trained on {policy.proprio} proprioception, the env's is {proprio}: "
-            f"build the env with proprio={policy.proprio!r}, or train a {name} with proprio={proprio!r}"
+            f"build the env with proprio={policy.proprio!r}, or train a policy with proprio={proprio!r}"
         )
-
-
-def _spec(spec: TensorSpec, key: tuple[str, ...]) -> TensorSpec | None:
-    for part in key:
-        if part not in spec.keys():
-            return None
-        spec = spec[part]
-    return spec
