@@ -114,7 +114,7 @@ class SeenInstructions:
 
     Examples:
         >>> seen = SeenInstructions("the policy", ["open the drawer"])
-        >>> with warnings.catch_warnings(record=True) as caught:
+        >>> with warnings.catch_warnings(action="always", record=True) as caught:
         ...     seen.check(["open the drawer", "close the drawer", "close the drawer"])
         >>> [str(warning.message)[:61] for warning in caught]
         ["the policy was never trained on the instruction 'close the dr"]
