@@ -232,7 +232,7 @@ def test_provenance_says_what_a_replay_needs(tmp_path):
     metadata = described["metadata"]
     assert metadata["tasks"] == TASKS and metadata["task_ids"] == [0, 1] and metadata["stage"] == "test"
     assert metadata["digests"] == [task.digest for task in env.tasks] and len(set(metadata["digests"])) == 2
-    assert metadata["instructions"] == ["open the top drawer", "turn on the stove"]
+    assert metadata["instructions"] == [task.language for task in env.tasks]
     assert metadata["env"]["seed"] == 0 and metadata["env"]["max_steps"] == 6 and metadata["config"] == {"lr": [1, 2]}
     assert metadata["models"]["policy"] == model_hash(model)
     camera = metadata["calibration"][TASKS[0]]["agentview"]

@@ -76,7 +76,7 @@ def provenance(
         size = getattr(base, "image_size", 64)
         metadata["tasks"] = [task.name for task in known]
         metadata["task_ids"] = _distinct([own.get(task.name, place) for place, task in enumerate(known)], known)
-        metadata["digests"] = [getattr(task, "digest", None) for task in known]
+        metadata["digests"] = [task.digest for task in known]
         metadata["instructions"] = [task.language for task in known]
         metadata["calibration"] = {task.name: _calibration(task, size) for task in known}
     for index, task in enumerate(known):

@@ -210,15 +210,26 @@ def recorded_task(source: Source, notes: list[str]) -> Task:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "task.bddl"
             path.write_bytes(text)
-            task = load_bddl(path, name=name)
+            task = _with_stored_states(load_bddl(path, name=name))
     else:
         task = load_task(name)
     digests = source.metadata.get("digests", [])
-    recorded, now = digests[place] if place < len(digests) else None, getattr(task, "digest", None)
-    if None not in (recorded, now) and recorded != now:
-        notes.append(f"the task {name} is not the one that was recorded: its digest was {recorded}, it is {now}")
+    recorded = digests[place] if place < len(digests) else None
+    if recorded not in (None, task.digest):
+        notes.append(f"the task {name} is not the one that was recorded: its digest was {recorded}, is {task.digest}")
     _compare_scene(task, attached.get(f"{place}.mjb"), source, notes)
     return task
+
+
+def _with_stored_states(task: Task) -> Task:
+    """The same task with the initial states that are stored beside its file, where that is still there."""
+    from worldenv_trl.scenes import load_task
+
+    try:
+        known = load_task(task.name)
+    except (ValueError, FileNotFoundError):
+        return task
+    return known if known.digest == task.digest else task
 
 
 def _place(source: Source) -> int | None:
