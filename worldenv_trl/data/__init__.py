@@ -7,6 +7,7 @@ from worldenv_trl.data.imagine import imagine_episodes
 from worldenv_trl.data.lerobot import write_lerobot
 from worldenv_trl.data.lerobot_reader import read_lerobot
 from worldenv_trl.data.samples import policy_samples
+from worldenv_trl.data.score import score_episodes
 from worldenv_trl.data.store import fill_store, open_store
 from worldenv_trl.data.windows import WindowBuffer, WindowSampler, predicted_poses, window_buffer
 
@@ -23,6 +24,7 @@ __all__ = [
     "predicted_poses",
     "read_hdf5",
     "read_lerobot",
+    "score_episodes",
     "window_buffer",
     "write_lerobot",
 ]

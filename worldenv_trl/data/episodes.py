@@ -148,6 +148,21 @@ class Episodes:
             changed[name] = value
         return Episodes(changed, self.instructions, frames)
 
+    def through(self, cameras: Sequence[str]) -> Episodes:
+        """The same episodes as some of their cameras show them.
+
+        Raises:
+            ValueError: for a camera of which there are no frames.
+        """
+        missing = [camera for camera in cameras if camera not in self.cameras]
+        if missing:
+            raise ValueError(f"the episodes show {', '.join(self.cameras)}, not {', '.join(missing)}")
+        if tuple(cameras) == self.cameras:
+            return self
+        out = self._with(self.entries, self.instructions, torch.arange(len(self)))
+        out._parts = [part.select(*(frames_key(camera) for camera in cameras)) for part in self._parts]
+        return out
+
     @staticmethod
     def cat(parts: Sequence[Episodes]) -> Episodes:
         """Several sets of episodes as one, which reads each one's frames where they are.

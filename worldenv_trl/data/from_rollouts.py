@@ -12,7 +12,6 @@ from worldenv_trl.keys import (
     CHUNK,
     CONTEXT_ID,
     FRAMES,
-    INSTRUCTION,
     KINEMATIC_STATE,
     KINEMATIC_STATES,
     MASK,
@@ -52,7 +51,7 @@ def episodes_from_rollouts(rollouts: TensorDictBase) -> Episodes:
     present = set(rollouts.keys(True, True))
     decisions = CHUNK in present and ACTION not in present
     cameras = _cameras(rollouts, decisions)
-    needed = [CHUNK if decisions else ACTION, *_ROOT, *(image_key(camera) for camera in cameras), INSTRUCTION]
+    needed = [CHUNK if decisions else ACTION, *_ROOT, *(image_key(camera) for camera in cameras)]
     needed += [("next", *_path(key)) for key in (STATES, KINEMATIC_STATES, STEP_MASK)] if decisions else []
     needed += [] if decisions else [("next", *_path(key)) for key in (STATE, KINEMATIC_STATE)]
     missing = [key for key in needed if key not in present]
