@@ -32,7 +32,7 @@ from worldenv_trl.keys import (
     SUCCESS_PROB,
     TASK_ID,
     WRIST_IMAGE,
-    image_entry,
+    camera_of,
 )
 from worldenv_trl.language import instructions_of
 from worldenv_trl.record.mcap.reader import read_attachments, read_metadata, read_rollouts
@@ -41,7 +41,7 @@ from worldenv_trl.record.mcap.tasks import task_names, task_numbers
 if TYPE_CHECKING:
     from worldenv_trl.scenes import Task
 
-__all__ = ["Source", "camera_of", "image_entries", "observed", "open_rollout", "recorded_task"]
+__all__ = ["Source", "image_entries", "observed", "open_rollout", "recorded_task"]
 
 
 @dataclass(frozen=True)
@@ -147,11 +147,6 @@ def image_entries(entries: TensorDictBase) -> list[str]:
                 names.add(name)
     first = [IMAGE[1], WRIST_IMAGE[1]]
     return sorted(names, key=lambda name: (first.index(name) if name in first else len(first), name))
-
-
-def camera_of(entry: str) -> str:
-    """The scene camera that an entry below ``observation`` is the image of."""
-    return next((camera for camera in ("agentview", "wrist") if image_entry(camera) == entry), entry)
 
 
 def observed(entries: TensorDictBase, first: int = 0) -> dict[str, tuple[Tensor, Tensor]]:
