@@ -230,11 +230,14 @@ def test_provenance_says_what_a_replay_needs(tmp_path):
     model = torch.nn.Linear(3, 2)
     described = provenance(env, models={"policy": model}, config={"lr": (1, 2)}, stage="test")
     metadata = described["metadata"]
-    assert metadata["tasks"] == TASKS and metadata["task_ids"] == [0, 2] and metadata["stage"] == "test"
+    assert metadata["tasks"] == TASKS and metadata["task_ids"] == [0, 1] and metadata["stage"] == "test"
+    assert metadata["digests"] == [task.digest for task in env.tasks] and len(set(metadata["digests"])) == 2
+    assert metadata["instructions"] == [task.language for task in env.tasks]
     assert metadata["env"]["seed"] == 0 and metadata["env"]["max_steps"] == 6 and metadata["config"] == {"lr": [1, 2]}
     assert metadata["models"]["policy"] == model_hash(model)
     camera = metadata["calibration"][TASKS[0]]["agentview"]
-    assert camera["intrinsics"] == env.tasks[0].cameras[0].intrinsics(32).tolist()
+    assert camera["intrinsics"] == env.tasks[0].cameras[0].intrinsics(32).tolist() and camera["mount"] == "world"
+    assert metadata["calibration"][TASKS[0]]["wrist"]["mount"] == "tool"
     recorder = recorded(env, tmp_path / "a.mcap", **described)
     recorder.rollout(1)
     recorder.close()
