@@ -18,7 +18,7 @@ from torchrl.envs.transforms import TransformedEnv
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.data import episodes_from_rollouts
-from worldenv_trl.envs import TabletopEnv, chunked
+from worldenv_trl.envs import ChunkedActions, TabletopEnv, chunked
 from worldenv_trl.kinematics import ActionMap, ForwardKinematics
 from worldenv_trl.record import Recorder, list_rollouts, model_hash, provenance, read_rollouts, recorded
 from worldenv_trl.record.mcap.records import McapWriter
@@ -68,7 +68,7 @@ def test_chunks_are_recorded_as_decisions_with_their_last_one(tmp_path):
     read = read_rollouts(tmp_path / "a.mcap")
     assert_recorded(read, wave, but=("returns",))
     assert episodes_from_rollouts(read)["length"].flatten().tolist() == [7] * 4
-    flattened = TransformedEnv(chunked(make_env(), 4), Recorder(tmp_path / "b.mcap"))
+    flattened = TransformedEnv(TransformedEnv(make_env(), ChunkedActions(4)), Recorder(tmp_path / "b.mcap"))
     with pytest.raises(ValueError, match=r"record it with recorded\(env, path\)"):
         flattened.rollout(1)
 
