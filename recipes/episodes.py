@@ -16,7 +16,7 @@ def demonstrations(run: Run) -> Episodes:
 
 
 def demonstrations_and_exploration(run: Run, rounds: int) -> tuple[Episodes, Episodes]:
-    """Demonstrations, and the exploration of the first ``rounds`` rounds; their frames stay on disk, in ``episodes/``."""
+    """Demonstrations, and the exploration of the first ``rounds`` rounds; frames stay on disk, in ``episodes/``."""
     files = [run.folder.require_rollouts("demonstrations", "demonstrate")]
     names = ["explore" + ("" if number == 1 else f"_{number}") for number in range(1, rounds + 1)]
     files += [run.folder.require_rollouts(name, "explore") for name in names]

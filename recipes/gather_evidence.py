@@ -121,7 +121,7 @@ def _filled(settings: Any, values: dict[str, Any]) -> Any:
 
 
 def clips(worlds: TwoWorlds, policy: str, config: WorldEnvConfig, rule: StopRule) -> list[Clip]:
-    """Every episode of a policy, in both worlds, its cameras side by side."""
+    """Every episode of a policy, in both worlds, its cameras one above the other."""
     out = []
     for row in range(len(worlds.episodes)):
         steps = int(worlds.episodes["length"][row]) + 1
@@ -149,9 +149,9 @@ def clips(worlds: TwoWorlds, policy: str, config: WorldEnvConfig, rule: StopRule
 
 
 def _film(episodes: Episodes, row: int, steps: int, cameras: tuple[str, ...]) -> Tensor:
-    """uint8 [steps, 3, H, V W]."""
+    """uint8 [steps, 3, V H, W]."""
     frame = torch.arange(steps)
-    return torch.cat([episodes.frames(camera, torch.full_like(frame, row), frame) for camera in cameras], -1)
+    return torch.cat([episodes.frames(camera, torch.full_like(frame, row), frame) for camera in cameras], -2)
 
 
 def _honesty_rows(worlds: TwoWorlds, policy: str, config: WorldEnvConfig) -> list[dict[str, Any]]:

@@ -1,14 +1,17 @@
 """Chunked actions: one decision is exactly its steps, and a stop inside a chunk stops there."""
 
+import dataclasses
+
 import pytest
 import torch
+from torchrl.data import Unbounded
+from torchrl.envs.transforms import RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from worldenv_trl.envs import ExpertPolicy, TabletopEnv, chunked
 from worldenv_trl.keys import (
     ACTION,
     CHUNK,
-    FRAMES,
     IMAGE,
     KINEMATIC_STATE,
     KINEMATIC_STATES,
@@ -18,10 +21,15 @@ from worldenv_trl.keys import (
     STATES,
     STEP_MASK,
     SUCCESS,
+    frames_key,
+    image_key,
 )
+from worldenv_trl.robot import look_at
+from worldenv_trl.scenes import load_task
 
 DRAWER = "starter/open_the_top_drawer"
 C = 4
+FRAMES = frames_key("agentview")
 
 
 def make(n=2, **options):
@@ -117,6 +125,93 @@ def test_a_partial_reset_clears_the_mask_of_its_rows_only_in_the_observation():
     td["_reset"] = torch.tensor([[True], [False]])
     after = env.reset(td)
     assert after[NUM_STEPS].flatten().tolist() == [0, 2 * C] and not after[STEP_MASK][0].any()
+
+
+@pytest.mark.filterwarnings("ignore:.*blew up")
+@pytest.mark.parametrize("alone", [False, True], ids=["beside rows that go on", "alone"])
+def test_a_row_whose_physics_blow_up_inside_a_chunk_is_done_after_it(alone):
+    env, n = chunked(make(1 if alone else 3, cameras=()), C), 1 if alone else 3
+    scene, row = env.base_env.scenes[0][0], n - 1
+    td, zeros = env.reset(), torch.zeros(n, C, 7)
+    step, calls = type(scene)._aim, []
+
+    def spoiled(self, rows, *rest):
+        before = step(self, rows, *rest)
+        calls.append(rows.tolist())
+        if len(calls) == 2:  # in the second of the chunk's steps
+            self.qvel[row, -6:] = 1e8
+        return before
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(scene), "_aim", spoiled)
+        rollout = env.rollout(
+            3, lambda td: td.set(CHUNK, zeros), tensordict=td, auto_reset=False, break_when_all_done=True
+        )
+    first = rollout["next"][row, 0]
+    assert first[STEP_MASK].tolist() == [True, True, False, False] and first[NUM_STEPS].item() == 2
+    assert first["done"] and first["truncated"] and not first["terminated"]
+    others = [index for index in range(n) if index != row]
+    assert calls == [list(range(n))] * 2 + [others] * (10 if others else 0)  # it is not stepped again
+    if others:
+        assert rollout["next", "done"].squeeze(-1).tolist() == [[False] * 3] * 2 + [[True] * 3]
+
+
+@pytest.mark.filterwarnings("ignore:.*blew up")
+def test_a_collected_row_begins_anew_after_its_physics_blew_up_inside_a_chunk():
+    env = chunked(make(2, cameras=()), C)
+    td = env.reset()
+    env.base_env.scenes[0][0].qvel[1, -6:] = 1e8
+    rollout = env.rollout(
+        2, lambda td: td.set(CHUNK, torch.zeros(2, C, 7)), tensordict=td, auto_reset=False, break_when_any_done=False
+    )
+    assert rollout["next", "done"].squeeze(-1).tolist() == [[False, False], [True, False]]
+    assert rollout[NUM_STEPS].squeeze(-1).tolist() == [[0, C], [0, 0]]
+    assert rollout["next", NUM_STEPS].squeeze(-1).tolist() == [[C, 2 * C], [1, C]]
+
+
+def test_frames_of_every_camera_are_collected():
+    task = load_task(DRAWER)
+    task = dataclasses.replace(
+        task, cameras=(*task.cameras, look_at("sideview", (0.0, 0.8, 0.4), (0.0, 0.0, 0.1), 45.0))
+    )
+    names = ("agentview", "wrist", "sideview")
+    env = chunked(TabletopEnv(task, 2, image_size=16, cameras=names, seed=0, num_threads=1), C, frames=True)
+    check_env_specs(env)
+    out = env.step(env.reset().set(CHUNK, plan(C, 2).transpose(0, 1)))["next"]
+    assert (
+        {entry for _, entry in map(frames_key, names)}
+        == set(out["frames"].keys())
+        == {"image", "wrist_image", "sideview"}
+    )
+    for name in names:
+        frames = out[frames_key(name)]
+        assert frames.shape == (2, C, 3, 16, 16) and frames.dtype == torch.uint8
+        assert torch.equal(frames[:, -1], out[image_key(name)]) and frames.float().std() > 5
+    env.close()
+
+
+def test_without_images_only_states_are_collected():
+    env = chunked(make(2, cameras=()), C, frames=True)
+    out = env.step(env.reset().set(CHUNK, torch.zeros(2, C, 7)))["next"]
+    assert "frames" not in out.keys() and out[STATES].shape == (2, C, 7)  # noqa: SIM118
+
+
+def test_a_chunk_is_a_sample_without_bounds_and_the_env_clips_it():
+    env = chunked(make(2, cameras=()), C)
+    spec = env.full_action_spec[CHUNK]
+    assert isinstance(spec, Unbounded) and spec.shape == (2, C, 7)
+    large, one = (env.step(env.reset().set(CHUNK, torch.full((2, C, 7), value)))["next"] for value in (30.0, 1.0))
+    assert torch.equal(large[STATE], one[STATE])
+
+
+def test_the_chunk_s_length_is_read_through_transforms():
+    env = chunked(make(2, cameras=()), C)
+    wrapped = TransformedEnv(TransformedEnv(env, StepCounter()), RewardSum(), auto_unwrap=True)
+    assert env.chunk_length == getattr(wrapped, "chunk_length", None) == C
+    assert chunked(TransformedEnv(make(2, cameras=()), StepCounter()), 3).chunk_length == 3
+    assert getattr(make(2, cameras=()), "chunk_length", None) is None
+    assert getattr(TransformedEnv(make(2, cameras=()), StepCounter()), "chunk_length", None) is None
+    check_env_specs(wrapped)
 
 
 def test_chunks_that_cannot_be_are_refused():

@@ -98,7 +98,7 @@ def test_rows_of_a_mixed_batch_are_those_of_their_task_alone():
     plan = 0.6 * actions(5, 6)
     mixed = play(make(TASKS, 6, init_state_mode="cycle"), plan)
     for slot, task in enumerate(TASKS):
-        alone = play(make(task, 2, init_state_mode="cycle"), plan[:, slot::3])
+        alone = play(make(task, 2, task_ids=[slot], init_state_mode="cycle"), plan[:, slot::3])
         for many, one in zip(mixed, alone, strict=True):
             size = one[SIM_STATE].shape[-1]
             assert_equal_rows(many[slot::3], one, [key for key in SHOWN if key != SIM_STATE])
@@ -161,12 +161,22 @@ def test_a_state_is_honoured_through_transforms():
 
 
 def test_a_context_id_alone_names_the_initial_state():
-    env = make(STOVE, 3, with_sim_state=False, init_state_mode="cycle")
+    env = make(STOVE, 3, task_ids=[2], with_sim_state=False, init_state_mode="cycle")
     wanted = torch.tensor([context_id(2, "train", 7), context_id(2, "test", 60), context_id(2, "train", 0)])
     td = env.reset(TensorDict({CONTEXT_ID: wanted.unsqueeze(-1)}, [3]), set_state=True)
     assert td[CONTEXT_ID].flatten().tolist() == wanted.tolist()
     other = make(STOVE, 1, init_split="test", init_state_mode="fixed", init_state_id=60).reset()
     assert torch.equal(td[IMAGE][1:2], other[IMAGE]) and torch.equal(td[KINEMATIC_STATE][1:2], other[KINEMATIC_STATE])
+
+
+def test_the_tasks_numbers_are_those_that_the_run_gives_them():
+    env = make([STOVE, DRAWER], 4, cameras=(), task_ids=(7, 3), init_state_mode="cycle")
+    td = env.reset()
+    assert env.task_ids == (7, 3) and [task.name for task in env.tasks] == [STOVE, DRAWER]
+    assert td[TASK_ID].flatten().tolist() == [7, 3, 7, 3]
+    assert td[CONTEXT_ID].flatten().tolist() == [context_id(task, "train", i) for i in (0, 1) for task in (7, 3)]
+    again = env.reset(td.clone(), set_state=True)
+    assert torch.equal(again[CONTEXT_ID], td[CONTEXT_ID])
 
 
 def test_a_state_that_happens_to_be_there_is_not_honoured():
@@ -211,6 +221,15 @@ def test_the_order_of_states_is_a_function_of_the_seed_only():
     assert torch.equal(order, ids(many, 1).flatten())
 
 
+def test_the_order_of_states_follows_from_the_task_whatever_its_number_and_company():
+    alone = ids(make(STOVE, 6, cameras=()), 2)
+    numbered = ids(make(STOVE, 6, cameras=(), task_ids=[5]), 2)
+    beside = ids(make([BOWL, STOVE], 12, cameras=()), 2)[:, 1::2]
+    assert torch.equal(numbered - context_id(5, "train", 0), alone)
+    assert torch.equal(beside - context_id(1, "train", 0), alone)
+    assert not torch.equal(ids(make(DRAWER, 6, cameras=()), 2), alone)  # another task, another order
+
+
 def test_the_rows_of_a_group_share_their_initial_state_and_task():
     env = make([BOWL, STOVE], 12, group_repeats=3)
     for _ in range(2):
@@ -252,11 +271,15 @@ def test_without_termination_rows_run_to_the_limit_and_reward_is_success():
     assert rollout["next", SUCCESS][:, -1].all() and not rollout["next", SUCCESS][:, 0].any()
 
 
+def blow_up(env, row):
+    env.scenes[0][0].qvel[row, -6:] = 1e8
+
+
 def test_physics_that_blow_up_end_their_own_row_only():
     env, calm = (TabletopEnv(BOWL, 3, image_size=32, seed=0, terminate_on_success=False) for _ in range(2))
     td, expected = env.reset(), calm.reset()
     scene = env.scenes[0][0]
-    scene.qvel[1, -6:] = 1e8
+    blow_up(env, 1)
     action = 0.3 * torch.ones(3, 7)
     with pytest.warns(UserWarning, match=r"put_the_bowl_on_the_plate: the physics of row 1 blew up at step 0 .*seed 0"):
         after = env.step(td.set("action", action))["next"]
@@ -269,8 +292,24 @@ def test_physics_that_blow_up_end_their_own_row_only():
     assert np.isfinite(scene.qpos).all() and np.abs(scene.qvel[1]).max() < 1
 
 
+@pytest.mark.filterwarnings("ignore:.*blew up")
+def test_an_end_stands_until_the_reset_whether_the_row_is_stepped_or_not():
+    env = make(BOWL, 3, cameras=())
+    td, still = env.reset(), torch.zeros(3, 7)
+    blow_up(env, 1)
+    for active in ([True, True, True], [True, False, False], [True, True, True]):
+        td = env.step(td.set(ACTION, still).set("_step", torch.tensor(active)))["next"]
+        for name in ("truncated", "done"):
+            assert td[name].flatten().tolist() == [False, True, False]
+        assert not td["terminated"].any()
+    partial = env.reset(TensorDict({"_reset": torch.tensor([True, False, False])[:, None]}, [3]))
+    assert partial["done"].flatten().tolist() == [False, True, False]
+    assert not env.reset()["done"].any()
+    assert not env.step(env.reset().set(ACTION, still))["next", "done"].any()
+
+
 def test_going_on_after_success_can_undo_it():
-    env = TabletopEnv(DRAWER, 4, cameras=(), seed=0, terminate_on_success=False)
+    env = make(DRAWER, 4, cameras=(), init_state_mode="cycle", terminate_on_success=False)
     opened = env.rollout(64, ExpertPolicy(env), break_when_any_done=False)["next", "success"]
     assert opened.any(1).all()
     td, expert = env.reset(), ExpertPolicy(env)
@@ -285,8 +324,8 @@ def test_going_on_after_success_can_undo_it():
     assert history.any() and not history[-1].any()
 
 
-def test_commanded_proprio_is_the_accumulated_target():
-    env = make(DRAWER, 1, cameras=(), proprio="commanded")
+def test_proprio_is_the_accumulated_target_unless_the_measured_one_is_asked_for():
+    env, measuring = make(DRAWER, 1, cameras=()), make(DRAWER, 1, cameras=(), proprio="measured")
     plan = torch.zeros(3, 1, 7)
     plan[..., 0], plan[..., 6] = 0.4, 1.0
     start = env.reset()
@@ -295,6 +334,8 @@ def test_commanded_proprio_is_the_accumulated_target():
     assert torch.allclose(moved[0, :3], torch.tensor([0.06, 0, 0]), atol=1e-6)
     assert moved[0, 6].item() == pytest.approx(-0.6, abs=1e-6)
     assert torch.allclose(end[STATE][0, :3], end[KINEMATIC_STATE][0, 7:10])
+    measured = play(measuring, plan)[-1]
+    assert torch.equal(measured[SIM_STATE], end[SIM_STATE]) and not torch.equal(measured[STATE], end[STATE])
 
 
 def test_actions_are_clipped():

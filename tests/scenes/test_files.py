@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
-import torch
 from torchrl.envs.utils import check_env_specs
 
 from worldenv_trl.envs import TabletopEnv
+from worldenv_trl.robot import WRIST, look_at
 from worldenv_trl.scenes import SceneBatch, ScriptedExpert, initial, load_task
+from worldenv_trl.scenes.simulation import cameras_of
 
 TEXT = """
 (define (problem tabletop) (:domain robosuite) (:language put the bowl on the plate and the soup in the basket)
@@ -85,7 +87,7 @@ def test_a_file_is_an_environment_like_any_other(path):
     rollout = env.rollout(4)
     assert rollout["observation", "image"].shape == (2, 4, 3, 32, 32)
     assert rollout[0, 0]["language_instruction"] == "put the bowl on the plate and the soup in the basket"
-    assert torch.equal(rollout["task_id"], torch.full_like(rollout["task_id"], load_task(path).task_id))
+    assert not rollout["task_id"].any()  # the first and only of this run
     env.close()
 
 
@@ -147,6 +149,36 @@ def test_a_goal_that_holds_from_the_start_is_refused_after_few_draws(path):
     message = r"two_things\.bddl:13: '\(On bowl_1 table_1_left_region\)': the goal holds in all of 100 draws"
     with pytest.raises(RuntimeError, match=message):
         load_task(path).init_states("train", 50)
+
+
+def test_comments_and_white_space_leave_a_task_and_its_states_what_they_are(path):
+    task = load_task(path)
+    initial.save_poses(task, task.states, 2)
+    drawn = task.init_states("train", 4)
+    path.write_text("; mine\n" + TEXT.replace(" (On soup_1", "\n\t( On  soup_1 ; here\n  ").replace("\n", "\r\n"))
+    commented = load_task(path)
+    assert commented.digest == task.digest and len(task.digest) == 64
+    assert np.array_equal(commented.init_states("train", 4), drawn)
+    path.write_text(TEXT.replace("-0.12 -0.20", "-0.12 -0.21"))
+    assert load_task(path).digest != task.digest
+
+
+def test_a_scene_has_the_cameras_of_its_task(path):
+    task = load_task(path)
+    side = look_at("sideview", (0.0, 0.9, 0.5), (0.0, 0.0, 0.05), 45.0)
+    palm = dataclasses.replace(WRIST, name="palm", fovy=60.0)
+    more = dataclasses.replace(task, cameras=(*task.cameras, side, palm))
+    assert list(cameras_of(more)) == ["agentview", "sideview", "wrist", "palm"]
+    assert more.build() is not task.build() and np.array_equal(more.init_states("test", 2), task.init_states("test", 2))
+    scene = SceneBatch(more, 2, cameras=("agentview", "palm", "wrist", "sideview"), image_size=32, num_threads=1)
+    scene.reset(np.arange(2), more.init_states("train", 2))
+    images = scene.render()
+    assert list(images) == ["agentview", "palm", "wrist", "sideview"]
+    assert all(image.std() > 10 for image in images.values())
+    plain = SceneBatch(task, 2, cameras=("wrist",), image_size=32, num_threads=1)
+    plain.reset(np.arange(2), task.init_states("train", 2))
+    assert np.array_equal(images["wrist"], plain.render()["wrist"])
+    assert not np.array_equal(images["wrist"], images["palm"])
 
 
 def test_states_stored_beside_a_file_are_its_standard_ones(path):

@@ -21,12 +21,12 @@ def scene_of(name: str, states: np.ndarray) -> SceneBatch:
     return scene
 
 
-def test_there_are_four_suites_of_ten_tasks_each_with_words_and_a_number_of_its_own():
+def test_there_are_four_suites_of_ten_tasks_each_with_words_and_a_digest_of_its_own():
     assert list_suites() == ["spatial", "object", "goal", "long"]
     tasks = [load_task(name) for name in NAMES]
     assert [len(list_tasks(suite)) for suite in list_suites()] == [10] * 4
     assert [task.name for task in tasks] == NAMES
-    assert len({task.task_id for task in tasks}) == len({task.language for task in tasks}) == 40
+    assert len({task.digest for task in tasks}) == len({task.language for task in tasks}) == 40
     assert max(len(task.language.split()) for task in tasks) <= OFTConfig.max_words
     assert all(task.name.startswith(f"{task.suite}/") for task in tasks)
     assert {task.language.split()[0] for task in tasks} >= {"put", "place", "pick", "open", "turn", "push", "take"}
@@ -92,7 +92,7 @@ def test_a_state_that_the_check_refuses_is_drawn_again_and_no_other(tmp_path):
 
 
 def test_states_of_another_version_of_a_file_are_refused():
-    task = dataclasses.replace(load_task(NAMES[0]), digest=1)
+    task = dataclasses.replace(load_task(NAMES[0]), digest="0" * 64)
     with pytest.raises(RuntimeError, match=r"another version of spatial/.*init_states.py"):
         task.init_states("train")
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import MultiAction, TransformedEnv
+from torchrl.envs.transforms import Compose, MultiAction, Transform, TransformedEnv
 
 from worldenv_trl.keys import (
     ACTION,
@@ -14,28 +14,35 @@ from worldenv_trl.keys import (
     CHUNK,
     CHUNK_LENGTH,
     FRAMES,
-    IMAGE,
-    KINEMATIC_DIM,
     KINEMATIC_STATE,
     KINEMATIC_STATES,
     STATE,
-    STATE_DIM,
     STATES,
     STEP_MASK,
 )
 
-__all__ = ["ChunkedActions", "chunked"]
-
-_PER_STEP = ((FRAMES, IMAGE), (STATES, STATE), (KINEMATIC_STATES, KINEMATIC_STATE))
+__all__ = ["ChunkedActions", "ChunkedEnv", "chunked"]
 
 
-def chunked(env: EnvBase, chunk_length: int = CHUNK_LENGTH, *, frames: bool = False) -> TransformedEnv:
+def chunked(env: EnvBase, chunk_length: int = CHUNK_LENGTH, *, frames: bool = False) -> ChunkedEnv:
     """An env whose action is a chunk ``("vla_action", "chunk")`` [*B, C, 7]; a step of it is one decision.
 
-    With ``frames`` it writes what :class:`~worldenv_trl.envs.ImaginedEnv` writes, under the same keys; a
-    :class:`~worldenv_trl.envs.Reflect` goes around ``env`` first, so that it can stop inside a chunk.
+    With ``frames`` it writes what :class:`~worldenv_trl.envs.ImaginedEnv` writes, under the same keys, for every camera
+    of ``env``; a :class:`~worldenv_trl.envs.Reflect` goes around ``env`` first, so that it can stop inside a chunk.
     """
-    return TransformedEnv(env, ChunkedActions(chunk_length, frames=frames), auto_unwrap=True)
+    return ChunkedEnv(env, ChunkedActions(chunk_length, frames=frames))
+
+
+class ChunkedEnv(TransformedEnv):
+    """What :func:`chunked` makes; transforms around it stay outside. ``chunk_length`` is C, through them too."""
+
+    @property
+    def chunk_length(self) -> int:
+        return next(part.chunk_length for part in _parts(self.transform) if isinstance(part, ChunkedActions))
+
+
+def _parts(transform: Transform) -> list[Transform]:
+    return list(transform) if isinstance(transform, Compose) else [transform]
 
 
 class ChunkedActions(MultiAction):
@@ -45,10 +52,12 @@ class ChunkedActions(MultiAction):
     reward, done flags and observations are those of its last step. (MultiAction loses the reward when every row
     finishes before the last action of a chunk.)
 
+    The chunk's spec is unbounded: a sample of a policy is not clipped, the env clips what it executes.
+
     Args:
         chunk_length: C.
-        frames: also write ``frames``, ``states`` and ``kinematic_states`` [*B, C, ...] of the steps that were executed;
-            the entries of the others repeat the last one.
+        frames: also write ``("frames", entry)`` of each camera, ``states`` and ``kinematic_states`` [*B, C, ...] of the
+            steps that were executed; the entries of the others repeat the last one.
 
     Raises:
         ValueError: for a chunk of another shape or dtype.
@@ -70,7 +79,7 @@ class ChunkedActions(MultiAction):
             torch.ones(parent.batch_size, dtype=torch.bool) if active is None else active.reshape(parent.batch_size)
         )
         self._executed: list[torch.Tensor] = []
-        self._shown: dict = {source: [] for _, source in _PER_STEP} if self.frames else {}
+        self._shown: dict = {source: [] for source in self._per_step(parent.observation_spec).values()}
         self._reward: torch.Tensor | None = None
         td = tensordict.copy()
         for index in range(self.chunk_length):
@@ -110,7 +119,7 @@ class ChunkedActions(MultiAction):
         dim, missing = self._active.ndim, self.chunk_length - len(self._executed)
         mask = torch.stack(self._executed, dim)
         out.set(STEP_MASK, torch.nn.functional.pad(mask, (0, missing)))
-        for target, source in _PER_STEP if self.frames else ():
+        for target, source in self._per_step(self.parent.observation_spec).items():
             values = self._shown[source]
             out.set(target, torch.stack(values + values[-1:] * missing, dim))
 
@@ -132,15 +141,22 @@ class ChunkedActions(MultiAction):
 
     # ------------------------------------------------------------------------------------------------- specs
 
+    def _per_step(self, observation_spec: Composite) -> dict:
+        """What is collected over a chunk: the entry that it is written to, and the one that each step writes."""
+        if not self.frames:
+            return {}
+        seen = observation_spec["observation"]
+        images = [entry for entry in seen.keys() if seen[entry].dtype == torch.uint8]  # noqa: SIM118 - no dict
+        sources = {(FRAMES, entry): ("observation", entry) for entry in images}
+        return {**sources, STATES: STATE, KINEMATIC_STATES: KINEMATIC_STATE}
+
     def _entries(self, observation_spec: Composite) -> dict:
         """Specs of the entries that this transform adds."""
         batch, device, length = observation_spec.shape, observation_spec.device, self.chunk_length
         entries = {STEP_MASK: Binary(shape=(*batch, length), dtype=torch.bool, device=device)}
-        if self.frames:
-            image = observation_spec[IMAGE].shape[len(batch) :]
-            entries[FRAMES] = Bounded(0, 255, shape=(*batch, length, *image), dtype=torch.uint8, device=device)
-            entries[STATES] = Unbounded(shape=(*batch, length, STATE_DIM), device=device)
-            entries[KINEMATIC_STATES] = Unbounded(shape=(*batch, length, KINEMATIC_DIM), device=device)
+        for target, source in self._per_step(observation_spec).items():
+            one = observation_spec[source]
+            entries[target] = one.unsqueeze(len(batch)).expand(*batch, length, *one.shape[len(batch) :]).clone()
         return entries
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
@@ -148,7 +164,7 @@ class ChunkedActions(MultiAction):
         one = action_spec[ACTION]
         shape = (*one.shape[:-1], self.chunk_length, one.shape[-1])
         del action_spec[ACTION]
-        action_spec[CHUNK] = Bounded(-1.0, 1.0, shape=shape, dtype=one.dtype, device=one.device)
+        action_spec[CHUNK] = Unbounded(shape=shape, dtype=one.dtype, device=one.device)
         input_spec["full_action_spec"] = action_spec
         return input_spec
 

@@ -12,7 +12,8 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import TransformedEnv
 
 from worldenv_trl.envs.tabletop import TabletopEnv
-from worldenv_trl.keys import ACTION, ACTION_DIM, NUM_STEPS
+from worldenv_trl.keys import ACTION, ACTION_DIM, INSTRUCTION, NUM_STEPS
+from worldenv_trl.language import instructions_of
 from worldenv_trl.scenes import PerturbedExpert, ScriptedExpert, Task
 
 __all__ = ["ExpertPolicy"]
@@ -45,17 +46,21 @@ class ExpertPolicy(TensorDictModuleBase):
             )
         self._parts = [(make_expert(scene.task), scene, rows) for scene, rows in env.scenes]
         self._num_envs, self._progress = env.num_envs, env.progress
+        self._words = [""] * env.num_envs
+        for scene, rows in env.scenes:
+            for row in rows:
+                self._words[row] = scene.task.language
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._check_same_env(tensordict)
         started = (tensordict[NUM_STEPS].reshape(-1) == 0).numpy()
+        self._check_same_env(tensordict, started)
         action = np.zeros((self._num_envs, ACTION_DIM), np.float32)
         for expert, scene, rows in self._parts:
             expert.reset(np.flatnonzero(started[rows]))
             action[rows] = expert(scene)
         return tensordict.set(ACTION, torch.from_numpy(action))
 
-    def _check_same_env(self, tensordict: TensorDictBase) -> None:
+    def _check_same_env(self, tensordict: TensorDictBase, started: np.ndarray) -> None:
         remedy = "make an ExpertPolicy of the env that it acts in, ExpertPolicy(env)"
         if tensordict.numel() != self._num_envs:
             raise ValueError(
@@ -72,3 +77,11 @@ class ExpertPolicy(TensorDictModuleBase):
                     f"this expert's env has {key}={int(own[row, 0])} in row {row}, the tensordict "
                     f"{int(shown.reshape(-1)[row])}: {remedy}, and call it with what that env showed last"
                 )
+        if (
+            started.any() and tensordict.get(INSTRUCTION, None) is not None
+        ):  # not every step: texts take time to compare
+            for row, (shown, own) in enumerate(zip(instructions_of(tensordict), self._words, strict=True)):
+                if shown != own:
+                    raise ValueError(
+                        f"this expert's env asks to {own!r} in row {row}, the tensordict {shown!r}: {remedy}"
+                    )

@@ -1,28 +1,19 @@
-"""Which initial state a row starts from, and the number that names it."""
+"""Which initial state a row starts from."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
-from worldenv_trl.scenes.tasks import MOST_STATES, SPLITS, Task
+from worldenv_trl.context_ids import UNKNOWN_CONTEXT, context_id, parts_of
+from worldenv_trl.scenes import Task
+
+__all__ = ["MODES", "InitStates"]
 
 MODES = ("random", "cycle", "fixed")
-UNKNOWN_CONTEXT = -1  # a state given by the caller without a number
-_PER_TASK, _PER_SPLIT = len(SPLITS) * MOST_STATES, MOST_STATES
-
-
-def context_id(task_id: int, split: str, index: int) -> int:
-    """The number of initial state ``index`` of a task's split; distinct over all tasks and both splits.
-
-    Raises:
-        ValueError: for an index out of [0, 50,000).
-    """
-    if not 0 <= index < _PER_SPLIT:
-        raise ValueError(f"the index of an initial state must be in [0, {_PER_SPLIT}), got {index}")
-    return task_id * _PER_TASK + SPLITS.index(split) * _PER_SPLIT + index
 
 
 class InitStates:
@@ -30,6 +21,9 @@ class InitStates:
 
     Args:
         task: the task.
+
+    Keyword Args:
+        task_id: the task's number in this run, which its states' context ids begin with.
         split: ``train`` or ``test``.
         mode: ``random`` (shuffled pass after shuffled pass over the states), ``cycle`` (in order, from
             ``init_state_id`` on) or ``fixed`` (``init_state_id`` always).
@@ -48,6 +42,7 @@ class InitStates:
         self,
         task: Task,
         *,
+        task_id: int = 0,
         split: str = "train",
         mode: str = "random",
         count: int = 50,
@@ -61,14 +56,16 @@ class InitStates:
             if context_ids is not None:
                 raise ValueError("context_ids names given init_states: pass both or neither")
             states = task.init_states(split, max(count, init_state_id + 1) if mode == "fixed" else count)
-            context_ids = [context_id(task.task_id, split, index) for index in range(len(states))]
+            context_ids = [context_id(task_id, split, index) for index in range(len(states))]
         else:
             states = _given_states(task, states)
             context_ids = [UNKNOWN_CONTEXT] * len(states) if context_ids is None else _numbers(context_ids, states)
         if not 0 <= init_state_id < len(states):
             raise ValueError(f"init_state_id must be in [0, {len(states)}), got {init_state_id}")
         self.task, self.mode, self.states, self.context_ids = task, mode, states, context_ids
-        self.init_state_id = init_state_id
+        self.task_id, self.init_state_id = task_id, init_state_id
+        # Of the order alone: a function of the task's name, not of its number in the run at hand.
+        self._identity = int.from_bytes(hashlib.sha256(task.name.encode()).digest()[:8], "big")
         self.seed(0)
 
     def seed(self, seed: int) -> None:
@@ -84,7 +81,7 @@ class InitStates:
         else:
             epoch, place = divmod(number, count)
             if epoch not in self._orders:
-                self._orders[epoch] = np.random.default_rng([self._seed, self.task.task_id, epoch]).permutation(count)
+                self._orders[epoch] = np.random.default_rng([self._seed, self._identity, epoch]).permutation(count)
             index = self._orders[epoch][place]
         return self.context_ids[index], self.states[index]
 
@@ -96,14 +93,13 @@ class InitStates:
         """
         if number != UNKNOWN_CONTEXT and number in self.context_ids:
             return self.states[self.context_ids.index(number)]
-        task, rest = divmod(number, _PER_TASK)
-        if task != self.task.task_id:
+        task_id, split, index = parts_of(number)
+        if task_id != self.task_id:
             raise ValueError(
-                f"context_id {number} names no initial state of {self.task.name} "
-                f"(its own are {self.task.task_id * _PER_TASK} and up): pass sim_state, or reset an env of that task"
+                f"context_id {number} names no initial state of {self.task.name} (its own are "
+                f"{context_id(self.task_id, 'train', 0)} and up): pass sim_state, or reset an env of that task"
             )
-        split, index = divmod(rest, _PER_SPLIT)
-        return self.task.init_states(SPLITS[split], index + 1)[index]
+        return self.task.init_states(split, index + 1)[index]
 
 
 def _given_states(task: Task, states: object) -> np.ndarray:

@@ -13,9 +13,18 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
-from worldenv_trl.envs.init_states import UNKNOWN_CONTEXT, InitStates
+from worldenv_trl.context_ids import UNKNOWN_CONTEXT
+from worldenv_trl.envs.init_states import InitStates
 from worldenv_trl.envs.row_texts import row_texts
-from worldenv_trl.envs.tabletop_arguments import check_cameras, check_counts, check_flag, check_whole, tasks_of
+from worldenv_trl.envs.tabletop_arguments import (
+    check_cameras,
+    check_counts,
+    check_flags,
+    check_numbers,
+    check_whole,
+    task_numbers,
+    tasks_of,
+)
 from worldenv_trl.envs.tabletop_specs import tabletop_specs
 from worldenv_trl.keys import (
     ACTION,
@@ -29,15 +38,12 @@ from worldenv_trl.keys import (
     STATE_DIM,
     SUCCESS,
     TASK_ID,
+    image_entry,
 )
 from worldenv_trl.scenes import RendererPool, SceneBatch, Task
 from worldenv_trl.scenes.simulation import measured_states, step_together
-from worldenv_trl.scenes.tasks import MOST_STATES
 
 __all__ = ["TabletopEnv"]
-
-_IMAGE_NAMES = {"agentview": "image", "wrist": "wrist_image"}  # below "observation"
-_LONGEST = 2**31 - 1  # steps
 
 
 @dataclass
@@ -56,7 +62,8 @@ class TabletopEnv(EnvBase):
 
     A row's episode is a function of (seed, number of the episode, actions), bit for bit, whatever the batch and the
     threads: the states that a batch of 16 draws in one reset are those that one row draws in 16 resets. A row whose
-    physics blows up is truncated, with a warning that says how to see it again; the others do not notice.
+    physics blows up is truncated, with a warning that says how to see it again; the others do not notice. A row that
+    has ended reports its end until it is reset, whether it is stepped or not.
 
     Args:
         task: a task, its name or file, or several: groups of rows are dealt to the tasks in turn (round robin).
@@ -64,8 +71,10 @@ class TabletopEnv(EnvBase):
 
     Keyword Args:
         image_size: height and width (px), at least 16.
-        cameras: ``agentview`` writes ``("observation", "image")``, ``wrist`` writes ``("observation", "wrist_image")``;
-            an empty tuple renders nothing.
+        task_ids: the tasks' numbers in this run, distinct and at least 0; 0, 1, ... in their order by default.
+        cameras: of the scenes, each written to its :func:`~worldenv_trl.keys.image_key`: ``agentview`` to
+            ``("observation", "image")``, ``wrist`` to ``("observation", "wrist_image")``, any other to
+            ``("observation", its name)``; an empty tuple renders nothing.
         init_split: ``train`` or ``test``.
         init_state_mode: ``random`` (shuffled passes), ``cycle`` (in order, reset after reset, so that every state gets
             its turn) or ``fixed``.
@@ -76,14 +85,14 @@ class TabletopEnv(EnvBase):
         terminate_on_success: end a row when its goal holds; reward is 1 on that step, else 0. When False, a row runs to
             ``max_steps`` and reward is the success of each step.
         max_steps: env steps after which a row is truncated; the task's own when None.
-        proprio: ``measured`` writes the hand's pose and opening as they are, ``commanded`` the controller's targets.
+        proprio: ``commanded`` writes the controller's targets, ``measured`` the hand's pose and opening as they are.
         with_sim_state: write MuJoCo's integration state, padded with zeros to the longest of the tasks.
         seed: of the order of initial states; drawn from torch's generator when None.
         num_threads: of physics, and processes that draw (this one, and helpers that start once they pay); two at most
             by default.
 
     Keys written: the images, ``("observation", "state")``, ``kinematic_state``, ``language_instruction``, ``task_id``,
-    ``context_id`` (:func:`~worldenv_trl.envs.init_states.context_id`), ``num_steps``, ``success``, optionally
+    ``context_id`` (:func:`~worldenv_trl.context_ids.context_id`), ``num_steps``, ``success``, optionally
     ``sim_state``; then ``reward``, ``done``, ``terminated``, ``truncated``.
 
     ``reset(td, set_state=True)`` starts every row from ``td``: from its ``sim_state`` (continuing at its ``num_steps``,
@@ -110,6 +119,7 @@ class TabletopEnv(EnvBase):
         task: str | Path | Task | Sequence[str | Path | Task],
         num_envs: int = 1,
         *,
+        task_ids: Sequence[int] | None = None,
         image_size: int = 64,
         cameras: Sequence[str] = ("agentview",),
         init_split: str = "train",
@@ -121,36 +131,29 @@ class TabletopEnv(EnvBase):
         group_repeats: int = 1,
         terminate_on_success: bool = True,
         max_steps: int | None = None,
-        proprio: str = "measured",
+        proprio: str = "commanded",
         with_sim_state: bool = False,
         seed: int | None = None,
         num_threads: int | None = None,
     ) -> None:
         tasks = tasks_of(task)
-        for name, value, low in (
-            ("num_envs", num_envs, 1),
-            ("group_repeats", group_repeats, 1),
-            ("num_threads", 1 if num_threads is None else num_threads, 1),
-            ("seed", 0 if seed is None else seed, 0),
-        ):
-            check_whole(name, value, low)
-        check_whole("max_steps", 1 if max_steps is None else max_steps, 1, _LONGEST)
-        check_whole("init_state_count", init_state_count, 1, MOST_STATES, "context ids tell no more of a split apart")
-        check_whole("init_state_id", init_state_id, 0, MOST_STATES - 1, "context ids tell no more of a split apart")
-        check_flag("terminate_on_success", terminate_on_success)
-        check_flag("with_sim_state", with_sim_state)
+        check_numbers(num_envs, group_repeats, num_threads, seed, max_steps, init_state_count, init_state_id)
+        check_flags(terminate_on_success=terminate_on_success, with_sim_state=with_sim_state)
         check_counts(tasks, num_envs, group_repeats)
         if proprio not in ("commanded", "measured"):
             raise ValueError(f"proprio must be 'commanded' or 'measured', got {proprio!r}")
         if init_states is not None and len(tasks) > 1:
             raise ValueError("init_states are of one task: build one env for each task")
-        check_cameras(cameras, _IMAGE_NAMES)
+        numbers = task_numbers(task_ids, tasks)
+        check_cameras(cameras, tasks)
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_envs]))
-        self.tasks, self.cameras, self.image_size = tuple(tasks), tuple(cameras), image_size
+        self.tasks, self.task_ids = tuple(tasks), numbers
+        self.cameras, self.image_size = tuple(cameras), image_size
         self.terminate_on_success, self.proprio, self.with_sim_state = terminate_on_success, proprio, with_sim_state
         starts = [
             InitStates(
                 item,
+                task_id=number,
                 split=init_split,
                 mode=init_state_mode,
                 count=init_state_count,
@@ -158,7 +161,7 @@ class TabletopEnv(EnvBase):
                 states=init_states,
                 context_ids=context_ids,
             )
-            for item in tasks
+            for item, number in zip(tasks, numbers, strict=True)
         ]
         group = np.arange(num_envs) // group_repeats
         threads = min(2 if num_threads is None else max(1, num_threads), num_envs)
@@ -187,22 +190,21 @@ class TabletopEnv(EnvBase):
         self._state = np.zeros((n, STATE_DIM), np.float32)
         self._kinematic = np.zeros((n, KINEMATIC_DIM), np.float32)
         self._sim_size = max(block.scene.batch.nstate for block in self._blocks)
-        self._context = np.full((n, 1), UNKNOWN_CONTEXT, np.int64)
-        self._steps = np.zeros((n, 1), np.int64)
-        self._success = np.zeros((n, 1), bool)
+        self._context, self._steps = np.full((n, 1), UNKNOWN_CONTEXT, np.int64), np.zeros((n, 1), np.int64)
+        self._success, self._terminated, self._truncated = (np.zeros((n, 1), bool) for _ in range(3))
         self._reward = np.zeros((n, 1), np.float32)
         self._task, self._limit = np.zeros((n, 1), np.int64), np.zeros((n, 1), np.int64)
         words = [""] * n
         for block in self._blocks:
             task = block.scene.task
-            self._task[block.rows] = task.task_id
+            self._task[block.rows] = block.starts.task_id
             self._limit[block.rows] = task.max_steps if max_steps is None else max_steps
             for row in block.rows:
                 words[row] = task.language
         self._text = row_texts(words, self.device)
 
     def _make_specs(self) -> None:
-        images = {_IMAGE_NAMES[name]: image.shape[1:] for name, image in self._images.items()}
+        images = {image_entry(name): image.shape[1:] for name, image in self._images.items()}
         width = self._sim_size if self.with_sim_state else None
         specs = tabletop_specs(self.batch_size, images, self.tasks[0].language, width)
         self.observation_spec, self.state_spec, self.action_spec, self.reward_spec, self.done_spec = specs
@@ -239,7 +241,7 @@ class TabletopEnv(EnvBase):
         mask = np.ones(self.num_envs, bool) if mask is None else mask.reshape(-1).numpy()
         # Rows reset together stay in step, so that the rows of a group share their initial states.
         self._episode[mask] = self._episode[mask].max(initial=-1) + 1 if mask.all() else self._episode[mask] + 1
-        self._steps[mask] = 0
+        self._steps[mask], self._terminated[mask], self._truncated[mask] = 0, False, False
         for block in self._blocks:
             local = np.flatnonzero(mask[block.rows])
             if not len(local):
@@ -250,9 +252,7 @@ class TabletopEnv(EnvBase):
             self._context[rows, 0] = numbers
         self._read(mask)
         self._reward[mask] = 0
-        out = self._observe()
-        out.update(self.full_done_spec.zero())
-        return out
+        return self._observe()
 
     def _drawn(self, block: _Block, local: np.ndarray) -> tuple[list[int], np.ndarray]:
         """The next initial states of a task's rows."""
@@ -268,7 +268,7 @@ class TabletopEnv(EnvBase):
         sim_state, numbers, task = (given.get(key, None) for key in (SIM_STATE, CONTEXT_ID, TASK_ID))
         if sim_state is None and numbers is None:
             raise ValueError(f"reset(set_state=True) needs {SIM_STATE!r} or {CONTEXT_ID!r} in its tensordict")
-        if task is not None and (task.reshape(-1).numpy()[rows] != block.scene.task.task_id).any():
+        if task is not None and (task.reshape(-1).numpy()[rows] != block.starts.task_id).any():
             raise ValueError(
                 f"reset(set_state=True): rows {rows.tolist()} run {block.scene.task.name}, {TASK_ID} says otherwise"
             )
@@ -314,13 +314,10 @@ class TabletopEnv(EnvBase):
         self._steps[active] += 1
         self._read(active)
         self._reward[active] = self._success[active]
-        out = self._observe()
-        terminated = self._success & self.terminate_on_success
-        truncated = ~terminated & (broken | (self._steps >= self._limit))
-        out.set("reward", torch.from_numpy(self._reward.copy()))
-        for name, value in (("terminated", terminated), ("truncated", truncated), ("done", terminated | truncated)):
-            out.set(name, torch.from_numpy(value))
-        return out
+        running = active[:, None] & ~(self._terminated | self._truncated)  # until now: an end stands until the reset
+        self._terminated |= running & self._success & self.terminate_on_success
+        self._truncated |= running & ~self._terminated & (broken | (self._steps >= self._limit))
+        return self._observe().set("reward", torch.from_numpy(self._reward.copy()))
 
     def _checked_action(self, tensordict: TensorDictBase, active: np.ndarray) -> np.ndarray:
         action = tensordict.get(ACTION, None)
@@ -366,14 +363,17 @@ class TabletopEnv(EnvBase):
             self._success[rows, 0] = block.scene.success()[local]
 
     def _observe(self) -> TensorDictBase:
-        """A copy of what all rows show."""
-        copies = {_IMAGE_NAMES[name]: image.copy() for name, image in self._images.items()}
+        """A copy of what all rows show, and whether they have ended."""
+        copies = {image_entry(name): image.copy() for name, image in self._images.items()}
         copies["state"] = self._state.copy()
         out = {
             "observation": {name: torch.from_numpy(value) for name, value in copies.items()},
             KINEMATIC_STATE: torch.from_numpy(self._kinematic.copy()),
             **{key: torch.from_numpy(value) for key, value in self.progress().items()},
             SUCCESS: torch.from_numpy(self._success.copy()),
+            "terminated": torch.from_numpy(self._terminated.copy()),
+            "truncated": torch.from_numpy(self._truncated.copy()),
+            "done": torch.from_numpy(self._terminated | self._truncated),
         }
         if self.with_sim_state:
             padded = np.zeros((self.num_envs, self._sim_size))

@@ -116,11 +116,11 @@ class ForwardKinematics(nn.Module):
         """The accumulated target [*B, 13]: x_des, R_des, commanded opening."""
         return kinematic_state[..., 7:20]
 
-    def state(self, kinematic_state: Tensor, proprio: str = "measured") -> Tensor:
+    def state(self, kinematic_state: Tensor, proprio: str = "commanded") -> Tensor:
         """Proprioception [*B, 7]: position (m), axis-angle (rad), opening.
 
-        ``proprio="measured"`` takes the pose of the joints, ``"commanded"`` the accumulated target, which is the same
-        number in physics and imagination.
+        ``proprio="commanded"`` takes the accumulated target, which is the same number in physics and imagination,
+        ``"measured"`` the pose of the joints.
         """
         if proprio not in ("measured", "commanded"):
             raise ValueError(f'proprio must be "measured" or "commanded", got {proprio!r}')

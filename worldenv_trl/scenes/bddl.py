@@ -8,6 +8,7 @@ a comment. The dialect was read off LIBERO's 130 files; the parser is our own.
 from __future__ import annotations
 
 import difflib
+import hashlib
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -51,7 +52,8 @@ class Problem:
 
     ``regions`` is keyed by ``target_name``, the name that predicates use; ``fixtures`` and ``objects`` map instances to
     categories. ``lines`` says where in the file ``("thing", name)``, ``("region", name)``, ``("init", *predicate)``,
-    ``("goal", *predicate)`` and ``("problem", kind)`` stand.
+    ``("goal", *predicate)`` and ``("problem", kind)`` stand. ``digest`` is the SHA-256 of what the file says, its words
+    and parentheses: comments and white space do not change it.
     """
 
     kind: str
@@ -62,6 +64,7 @@ class Problem:
     objects_of_interest: tuple[str, ...]
     init: tuple[tuple[str, ...], ...]
     goal: tuple[tuple[str, ...], ...]
+    digest: str = field(default="", compare=False)
     source: str = "<text>"
     lines: Mapping[tuple[str, ...], int] = field(default_factory=dict, compare=False, repr=False)
 
@@ -190,6 +193,7 @@ class _Parser:
             objects_of_interest=self._of_interest(blocks.get("obj_of_interest"), {**names, **regions}),
             init=tuple(self._predicate("init", item, names, regions) for item in blocks["init"].items[1:]),
             goal=self._goal(blocks["goal"], names, regions),
+            digest=hashlib.sha256(root.text.encode()).hexdigest(),
             source=self.source,
             lines=self.lines,
         )

@@ -13,7 +13,6 @@ __all__ = ["SUITES_FOLDER", "list_suites", "list_tasks", "load_task"]
 SUITES_FOLDER = Path(__file__).parent / "suites"
 STARTER = "starter"
 _MAX_STEPS = {STARTER: 72, "spatial": 120, "object": 120, "goal": 150, "long": 260}
-_FIRST_ID = {STARTER: 0, "spatial": 100, "object": 110, "goal": 120, "long": 130}
 
 
 def list_suites() -> list[str]:
@@ -22,7 +21,7 @@ def list_suites() -> list[str]:
 
 
 def list_tasks(suite: str) -> list[str]:
-    """Names of a suite's tasks, in the order of their ``task_id``; raises ``ValueError`` for an unknown suite."""
+    """Names of a suite's tasks, in alphabetical order; raises ``ValueError`` for an unknown suite."""
     if suite not in _MAX_STEPS:
         raise ValueError(f"unknown suite {suite!r}: it must be one of {', '.join([*list_suites(), STARTER])}")
     return [f"{suite}/{path.stem}" for path in sorted((SUITES_FOLDER / suite).glob("*.bddl"))]
@@ -69,7 +68,6 @@ def _load(name: str) -> FileTask:
         path,
         name=name,
         suite=suite,
-        task_id=_FIRST_ID[suite] + list_tasks(suite).index(name),
         max_steps=_MAX_STEPS[suite],
         states=path.with_suffix(".npz"),
     )

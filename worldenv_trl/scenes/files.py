@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -15,7 +14,7 @@ from worldenv_trl.scenes.bddl import Problem, read_bddl
 from worldenv_trl.scenes.canvas import Glow
 from worldenv_trl.scenes.entities import Primitive
 from worldenv_trl.scenes.entities.cookware import Stove
-from worldenv_trl.scenes.initial import draw_poses, load_poses, states_from_poses
+from worldenv_trl.scenes.initial import draw_poses, load_poses, states_from_poses, stored_seed
 from worldenv_trl.scenes.layout import Layout
 from worldenv_trl.scenes.relations import Relations
 from worldenv_trl.scenes.settings import compile_scene, setting_of
@@ -25,23 +24,28 @@ from worldenv_trl.scenes.tasks import Task
 __all__ = ["FileTask", "load_bddl"]
 
 MAX_STEPS = 300  # LIBERO's goal suite, in openvla-oft's protocol
-_FIRST_ID, _IDS = 1000, 9000
 
 
 @dataclass(frozen=True)
 class FileTask(Task):
     """A task whose scene, initial states and goal come from a file.
 
-    ``digest`` is the checksum of the file's text, and the seed of its initial states, which so stay the same when the
-    catalogue is numbered anew; ``states`` is the file of stored ones, if there is one.
+    ``digest`` is that of what the file says (:class:`~worldenv_trl.scenes.bddl.Problem`); ``states`` is the file of
+    stored initial states, if there is one. The scene has exactly the ``cameras`` of the task:
+    ``dataclasses.replace(task, cameras=(*task.cameras, look_at(...)))`` is the same task with one more.
     """
 
-    digest: int = 0
     states: Path | None = None
     problem: Problem | None = field(default=None, compare=False, repr=False)
 
     def build(self) -> mujoco.MjModel:
         return _scene(self)[1]
+
+    @property
+    def seed(self) -> int:
+        """What its initial states are drawn from: the stored ones' seed, without any the beginning of the digest."""
+        stored = None if self.states is None else stored_seed(self, self.states)
+        return int(self.digest[:15], 16) if stored is None else stored
 
     @property
     def entities(self) -> dict[str, Primitive]:
@@ -77,7 +81,6 @@ def load_bddl(
     max_steps: int = MAX_STEPS,
     name: str | None = None,
     suite: str = "file",
-    task_id: int | None = None,
     states: Path | None = None,
 ) -> FileTask:
     """The task of a BDDL file.
@@ -89,7 +92,6 @@ def load_bddl(
         max_steps: of an episode.
         name: the task's name; the path by default.
         suite: the suite it belongs to.
-        task_id: its number; one that follows from the file's text by default.
         states: a file of stored initial states.
 
     Raises:
@@ -99,16 +101,14 @@ def load_bddl(
     """
     path = Path(path)
     problem = read_bddl(path)
-    digest = zlib.crc32(path.read_bytes())
     task = FileTask(
         name=str(path) if name is None else name,
         suite=suite,
-        task_id=_FIRST_ID + digest % _IDS if task_id is None else task_id,
         language=problem.language,
         goal=problem.goal,
         max_steps=max_steps,
         cameras=(setting_of(problem).camera, WRIST),
-        digest=digest,
+        digest=problem.digest,
         states=states,
         problem=problem,
     )

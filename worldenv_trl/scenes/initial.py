@@ -23,7 +23,7 @@ from worldenv_trl.scenes.simulation import SceneBatch, home_state
 if TYPE_CHECKING:
     from worldenv_trl.scenes.files import FileTask
 
-__all__ = ["Check", "draw_poses", "load_poses", "save_poses", "states_from_poses"]
+__all__ = ["Check", "draw_poses", "load_poses", "save_poses", "states_from_poses", "stored_seed"]
 
 Check = Callable[[np.ndarray], np.ndarray]
 """Which of the integration states ``[n, S]`` may be kept, ``[n]`` bool: those that an expert solves, say."""
@@ -53,12 +53,12 @@ def _draw(task: FileTask, split: str, start: int, count: int, check: Check | Non
     data = mujoco.MjData(model)
     qpos, ctrl, targets = home_state(model, panda.HOME_Q)
     bind = scene.batch.bind
-    waiting, refusals = np.arange(count, dtype=np.int32), np.zeros(count, int)
+    waiting, refusals, seed = np.arange(count, dtype=np.int32), np.zeros(count, int), task.seed
     for attempt in range(_ATTEMPTS):
         drawn = np.zeros((len(waiting), len(things), 3))
         for row, index in enumerate(waiting):
             # One generator per state and attempt: a larger count extends a smaller one.
-            rng = np.random.default_rng([task.digest, SPLITS.index(split), start + int(index), attempt])
+            rng = np.random.default_rng([seed, SPLITS.index(split), start + int(index), attempt])
             data.qpos[:] = qpos
             task.layout.draw(data, rng)
             mujoco.mj_kinematics(model, data)
@@ -120,7 +120,7 @@ def load_poses(task: FileTask, path: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             poses = {split: stored[split] for split in SPLITS}
-            digest = int(stored["digest"])
+            digest = str(stored["digest"])
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise RuntimeError(
             f"{path} holds no initial states ({error}), and where it lies those of {task.name} are looked for: move it "
@@ -132,6 +132,17 @@ def load_poses(task: FileTask, path: Path) -> dict[str, np.ndarray]:
             f"{path.name} holds initial states of another version of {task.name}: make them again with {remedy}"
         )
     return poses
+
+
+def stored_seed(task: FileTask, path: Path) -> int | None:
+    """What the initial states in ``path`` were drawn from, so that more of them continue those that are there.
+
+    None if there is no such file, or one that holds something other than states of this version of the task.
+    """
+    if not path.exists() or not _holds_states(path):
+        return None
+    with np.load(path, allow_pickle=False) as stored:
+        return int(stored["seed"]) if "seed" in stored and str(stored["digest"]) == task.digest else None
 
 
 def save_poses(task: FileTask, path: Path, count: int, check: Check | None = None) -> dict[str, np.ndarray]:
@@ -154,7 +165,7 @@ def save_poses(task: FileTask, path: Path, count: int, check: Check | None = Non
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with unfinished.open("wb") as file:
-            np.savez_compressed(file, digest=np.int64(task.digest), **poses)
+            np.savez_compressed(file, digest=np.str_(task.digest), seed=np.int64(task.seed), **poses)
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -165,7 +176,7 @@ def _holds_states(path: Path) -> bool:
     """Whether a file holds initial states, of whatever task and version."""
     try:
         with np.load(path, allow_pickle=False) as stored:
-            return {"digest", *SPLITS} == set(stored)
+            return set(stored) - {"seed"} == {"digest", *SPLITS}
     except (TypeError, ValueError, EOFError, zipfile.BadZipFile):
         return False
 

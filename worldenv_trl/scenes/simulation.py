@@ -35,7 +35,7 @@ class SceneBatch:
         task: the task.
         num_envs: number of rows ``n``.
         image_size: height and width (px), from 16 to 4096.
-        cameras: cameras to render (``agentview``, ``wrist``), or none.
+        cameras: cameras of the scene to render (``agentview``, ``wrist`` and what else it has), or none.
         num_threads: of physics, and processes that draw (see :class:`RendererPool`); two by default.
         pool: draws the images, instead of threads of the batch's own; the batch does not close it.
 
@@ -60,7 +60,7 @@ class SceneBatch:
             raise ValueError(f"image_size must be a whole number from 16 to {_LARGEST_IMAGE} px, got {image_size!r}")
         self.task, self.num_envs, self.image_size = task, num_envs, int(image_size)
         self.model = task.build()
-        known = {_short_name(full): full for full in (self.model.camera(i).name for i in range(self.model.ncam))}
+        known = cameras_of(task)
         for name in cameras:
             if name not in known:
                 raise ValueError(f"unknown camera {name!r}: {task.name} has {', '.join(known)}")
@@ -224,8 +224,11 @@ def measured_states(scenes: Sequence[SceneBatch]) -> np.ndarray:
     return np.concatenate([position, rotation, np.clip(opening, 0, 1)], -1).astype(np.float32)
 
 
-def _short_name(camera: str) -> str:
-    return camera.removeprefix("panda/")
+def cameras_of(task: Task) -> dict[str, str]:
+    """Every camera of a task's scene: what it is called, and its name in the model; the robot's drop its prefix."""
+    model = task.build()
+    names = [model.camera(index).name for index in range(model.ncam)]
+    return {name.removeprefix("panda/"): name for name in names}
 
 
 def _joint_address(model: mujoco.MjModel, name: str) -> int:

@@ -25,14 +25,16 @@ __all__ = ["Task"]
 class Task(abc.ABC):
     """A task: a scene, an instruction and a goal.
 
-    ``goal`` is a conjunction of ``(predicate, argument, ...)``; ``task_id`` is the index in the catalogue.
+    ``goal`` is a conjunction of ``(predicate, argument, ...)``. What a task is, is said by its ``name``, and which
+    version of it by its ``digest``, a hexadecimal hash of what describes it; numbers are given by whoever runs it.
+    ``cameras`` are those of its scene that are described to others, see :meth:`camera`.
     """
 
     name: str
     suite: str
-    task_id: int
     language: str
     goal: tuple[tuple[str, ...], ...]
+    digest: str
     max_steps: int = 64
     cameras: tuple[Camera, ...] = (AGENTVIEW, WRIST)
 

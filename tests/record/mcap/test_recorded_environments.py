@@ -58,6 +58,8 @@ def test_steps_and_chunks_of_the_same_actions_make_the_same_episodes():
         steps.append(td)
         td = step_mdp(td, exclude_action=True)
     by_step = episodes_from_rollouts(torch.stack(steps, 1))
-    for key in ("frames", "states", "kinematic_states", "actions", "length", keys.CONTEXT_ID):
+    for key in ("states", "kinematic_states", "actions", "length", keys.CONTEXT_ID):
         assert torch.equal(by_chunk[key], by_step[key]), key
+    places = torch.arange(4)[:, None], torch.arange(7)
+    assert torch.equal(by_chunk.frames("agentview", *places), by_step.frames("agentview", *places))
     assert len(policy_samples(by_step)) == int(by_step["length"].sum())

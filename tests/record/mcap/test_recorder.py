@@ -18,7 +18,7 @@ from torchrl.envs.transforms import TransformedEnv
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.data import episodes_from_rollouts
-from worldenv_trl.envs import TabletopEnv, chunked
+from worldenv_trl.envs import ChunkedActions, TabletopEnv, chunked
 from worldenv_trl.kinematics import ActionMap, ForwardKinematics
 from worldenv_trl.record import Recorder, list_rollouts, model_hash, provenance, read_rollouts, recorded
 from worldenv_trl.record.mcap.records import McapWriter
@@ -68,7 +68,7 @@ def test_chunks_are_recorded_as_decisions_with_their_last_one(tmp_path):
     read = read_rollouts(tmp_path / "a.mcap")
     assert_recorded(read, wave, but=("returns",))
     assert episodes_from_rollouts(read)["length"].flatten().tolist() == [7] * 4
-    flattened = TransformedEnv(chunked(make_env(), 4), Recorder(tmp_path / "b.mcap"))
+    flattened = TransformedEnv(TransformedEnv(make_env(), ChunkedActions(4)), Recorder(tmp_path / "b.mcap"))
     with pytest.raises(ValueError, match=r"record it with recorded\(env, path\)"):
         flattened.rollout(1)
 
@@ -230,11 +230,14 @@ def test_provenance_says_what_a_replay_needs(tmp_path):
     model = torch.nn.Linear(3, 2)
     described = provenance(env, models={"policy": model}, config={"lr": (1, 2)}, stage="test")
     metadata = described["metadata"]
-    assert metadata["tasks"] == TASKS and metadata["task_ids"] == [0, 2] and metadata["stage"] == "test"
+    assert metadata["tasks"] == TASKS and metadata["task_ids"] == [0, 1] and metadata["stage"] == "test"
+    assert metadata["digests"] == [task.digest for task in env.tasks] and len(set(metadata["digests"])) == 2
+    assert metadata["instructions"] == [task.language for task in env.tasks]
     assert metadata["env"]["seed"] == 0 and metadata["env"]["max_steps"] == 6 and metadata["config"] == {"lr": [1, 2]}
     assert metadata["models"]["policy"] == model_hash(model)
     camera = metadata["calibration"][TASKS[0]]["agentview"]
-    assert camera["intrinsics"] == env.tasks[0].cameras[0].intrinsics(32).tolist()
+    assert camera["intrinsics"] == env.tasks[0].cameras[0].intrinsics(32).tolist() and camera["mount"] == "world"
+    assert metadata["calibration"][TASKS[0]]["wrist"]["mount"] == "tool"
     recorder = recorded(env, tmp_path / "a.mcap", **described)
     recorder.rollout(1)
     recorder.close()

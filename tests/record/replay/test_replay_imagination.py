@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import pytest
 import torch
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
@@ -14,52 +16,59 @@ from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import ExpertPolicy, ImaginedEnv, Reflect, TabletopEnv
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.record import RolloutWriter, provenance, read_metadata, read_rollouts, recorded, replay
-from worldenv_trl.reflectors import Reflector
+from worldenv_trl.reflectors import Reflector, StopRule
+from worldenv_trl.world_models import WorldModel
 
 C, SIZE, TASK = 4, 16, "starter/open_the_top_drawer"
+FRAMES, WRIST = keys.frames_key("agentview"), keys.frames_key("wrist")
 
 
-class Painter(TensorDictModuleBase):
+class Painter(WorldModel):
     """Red follows the gripper's action, green is noise of the seed, blue counts the frames; ``tint`` is its weight.
 
-    ``together`` adds the number of rows it is asked for at once: what rounding does, but visible.
+    ``together`` adds the number of rows it is asked for at once: what rounding does, but visible. The wrist's picture
+    is the others' upside down.
     """
 
-    chunk_length, image_size = C, SIZE
-    in_keys = ["padded_actions", "noise_seed", ("memory", "frames")]  # noqa: RUF012
-    out_keys = [keys.FRAMES]  # noqa: RUF012
-
-    def __init__(self, tint: int = 0, together: bool = False) -> None:
-        super().__init__()
+    def __init__(self, tint: int = 0, together: bool = False, cameras: Sequence[str] = ("agentview",)) -> None:
+        super().__init__(cameras=cameras, image_size=SIZE, chunk_length=C)
         self.register_buffer("tint", torch.tensor(tint))
         self.together, self.calls = together, 0
 
-    def memory_indices(self, steps: Tensor) -> Tensor:
-        return steps.unsqueeze(-1)
+    def memory_indices(self, now: Tensor) -> Tensor:
+        return now.unsqueeze(-1)
 
-    def forward(self, td: TensorDict) -> TensorDict:
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.calls += 1
-        frames = torch.zeros(len(td), C, 3, SIZE, SIZE, dtype=torch.uint8)
-        frames[:, :, 0] = ((td["padded_actions"][..., 6] + 1) * 100).to(torch.uint8)[..., None, None]
-        for row, seed in enumerate(td["noise_seed"].flatten().tolist()):
+        count = len(tensordict)
+        frames = torch.zeros(count, C, 3, SIZE, SIZE, dtype=torch.uint8)
+        frames[:, :, 0] = ((tensordict["padded_actions"][..., 6] + 1) * 100).to(torch.uint8)[..., None, None]
+        for row, seed in enumerate(tensordict["noise_seed"].flatten().tolist()):
             generator = torch.Generator().manual_seed(seed)
             frames[row, :, 1] = torch.randint(256, (C, SIZE, SIZE), generator=generator, dtype=torch.uint8)
-        newest = td["memory", "frames"][:, -1, 2, 0, 0].long()
+        newest = tensordict["memory", "frames", "image"][:, -1, 2, 0, 0].long()
         counted = (newest[:, None] + torch.arange(1, C + 1) + self.tint).to(torch.uint8)
-        frames[:, :, 2] = counted[..., None, None] + (len(td) if self.together else 0)
-        return td.set(keys.FRAMES, frames)
+        frames[:, :, 2] = counted[..., None, None] + (count if self.together else 0)
+        tensordict[FRAMES] = frames
+        if "wrist" in self.cameras:
+            tensordict[WRIST] = frames.flip(-2)
+        return tensordict
 
 
 class Redness(Reflector):
-    """Scores a prefix by the red of its last frame."""
+    """Scores a video by the red of its last frame."""
 
-    feature_dim = 1
+    factor = 1.0
 
-    def encode(self, frames: Tensor) -> Tensor:
-        return frames[:, 0, 0, :1].float() / 255
+    def begin(self, frames: Mapping[str, Tensor], instructions: Sequence[str]) -> TensorDict:
+        return TensorDict({"score": self._scores(frames["agentview"])}, [len(instructions)])
 
-    def logits(self, features: Tensor, lengths: Tensor, task_id: Tensor) -> Tensor:
-        return torch.logit(features[torch.arange(len(features)), lengths - 1, 0].clamp(0.001, 0.999))
+    def extend(self, state: TensorDictBase, frames: Mapping[str, Tensor]) -> tuple[TensorDict, Tensor]:
+        scores = self._scores(frames["agentview"])
+        return TensorDict({"score": scores[:, -1]}, state.batch_size), scores
+
+    def _scores(self, frames: Tensor) -> Tensor:
+        return (frames[..., 0, 0, 0].float() / 255 * self.factor).clamp(0.001, 0.999)
 
 
 def closing(stop: int):
@@ -73,13 +82,17 @@ def closing(stop: int):
     return TensorDictModule(chunk, [keys.NUM_STEPS], [keys.CHUNK])
 
 
+def imagined(model, steps):
+    contexts = TabletopEnv(TASK, 2, image_size=SIZE, cameras=model.cameras, seed=0, proprio="commanded").reset()
+    contexts = contexts.exclude("done", "terminated", "truncated")
+    return ImaginedEnv(model, ForwardKinematics(), contexts, [2, 2], max_steps=steps, seed=3)
+
+
 def imagine(path, model, *, reflector=None, described=True, steps=16):
-    start = TabletopEnv(TASK, 2, image_size=SIZE, seed=0, proprio="commanded").reset()
-    contexts = start.exclude("done", "terminated", "truncated")
-    env = ImaginedEnv(model, ForwardKinematics(), contexts, [2, 2], max_steps=steps, chunk_length=C, seed=3)
+    env = imagined(model, steps)
     models = {"world_model": model}
     if reflector is not None:
-        env, models["reflector"] = TransformedEnv(env, Reflect(reflector, threshold=0.7)), reflector
+        env, models["reflector"] = TransformedEnv(env, Reflect(reflector, StopRule(0.7))), reflector
     wave = next(iter(GroupCollector(env, closing(4), groups_per_batch=2)))
     about = provenance(env, models=models, tasks=[TASK]) if described else {}
     with RolloutWriter(path, **about) as writer:
@@ -94,11 +107,32 @@ def test_the_recorded_model_paints_the_same_frames_from_the_recorded_seeds(tmp_p
         report = replay(tmp_path / "a.mcap", row, world_model=model)
         assert report.exact is True and set(report.psnr.values()) == {float("inf")}
         played = read_rollouts(report.target)[0]
-        assert torch.equal(played["next", keys.FRAMES], wave["next", keys.FRAMES][row])
+        assert torch.equal(played["next", *FRAMES], wave["next", *FRAMES][row])
         assert torch.equal(played["next", keys.NOISE_SEED], wave["next", keys.NOISE_SEED][row])
-    assert not torch.equal(wave["next", keys.FRAMES][0], wave["next", keys.FRAMES][1])  # noise tells them apart
+    assert not torch.equal(wave["next", *FRAMES][0], wave["next", *FRAMES][1])  # noise tells them apart
     again = replay(report.target, 0, world_model=model, write=False)
     assert again.exact is True
+
+
+def test_every_camera_of_the_model_is_replayed_and_compared(tmp_path):
+    model = Painter(cameras=("agentview", "wrist"))
+    wave = imagine(tmp_path / "a.mcap", model).reshape(-1, 4)
+    report = replay(tmp_path / "a.mcap", 1, world_model=model)
+    assert report.exact is True and {"image", "wrist_image"} <= set(report.compared)
+    played = read_rollouts(report.target)[0]
+    for key in (FRAMES, WRIST):
+        assert torch.equal(played["next", *key], wave["next", *key][1])
+        assert torch.equal(played["next", "recorded", *key], wave["next", *key][1])
+    late = replay(tmp_path / "a.mcap", 1, world_model=Painter(7, cameras=model.cameras), from_step=8, write=False)
+    assert [step for step, value in late.psnr.items() if value == float("inf")] == list(range(9))
+    assert {each.field for each in late.divergences} == {"image", "wrist_image"}
+
+
+def test_a_model_of_a_camera_that_was_not_recorded_is_refused(tmp_path):
+    imagine(tmp_path / "a.mcap", Painter(), steps=4)
+    both = Painter(cameras=("agentview", "wrist"))
+    with pytest.raises(ValueError, match=r"paints agentview, wrist, but rollout 0 of .*a\.mcap shows agentview"):
+        replay(tmp_path / "a.mcap", world_model=both)
 
 
 def test_another_model_gives_a_difference_curve_and_no_claim(tmp_path):
@@ -138,9 +172,7 @@ def test_a_model_that_depends_on_its_batch_is_replayed_with_the_rows_of_its_wave
 
 def test_a_recorder_s_rollouts_are_replayed_with_their_wave_too(tmp_path):
     model = Painter(together=True)
-    start = TabletopEnv(TASK, 2, image_size=SIZE, seed=0, proprio="commanded").reset()
-    contexts = start.exclude("done", "terminated", "truncated")
-    env = ImaginedEnv(model, ForwardKinematics(), contexts, [2, 2], max_steps=8, chunk_length=C, seed=3)
+    env = imagined(model, 8)
     about = provenance(env, models={"world_model": model}, tasks=[TASK])
     env = recorded(env, tmp_path / "a.mcap", **about)
     for _ in range(2):
@@ -169,8 +201,7 @@ def test_the_reflector_stops_where_it_did_and_another_threshold_stops_elsewhere(
     assert same.outcome["replayed"]["last step"] == 13  # red is 200 / 255 from the fourth decision on
 
     class Hasty(Redness):
-        def encode(self, frames: Tensor) -> Tensor:
-            return super().encode(frames) * 1.3
+        factor = 1.3
 
     hasty = replay(tmp_path / "a.mcap", 0, world_model=model, reflector=Hasty(), write=False)
     (end,) = (each for each in hasty.divergences if each.field == "end")
@@ -201,8 +232,8 @@ def test_before_the_branch_the_model_is_not_asked(tmp_path):
     )
     assert model.calls == 2 * 2  # with and without the change
     played = read_rollouts(tmp_path / "b.mcap")[0]
-    assert torch.equal(played["next", keys.FRAMES][:2], wave["next", keys.FRAMES][1, :2])
-    assert report.first.step == 9 and played["next", "recorded", "frames"].shape == (4, C, 3, SIZE, SIZE)
+    assert torch.equal(played["next", *FRAMES][:2], wave["next", *FRAMES][1, :2])
+    assert report.first.step == 9 and played["next", "recorded", *FRAMES].shape == (4, C, 3, SIZE, SIZE)
 
 
 def test_real_rollouts_replay_in_imagination_and_imagined_ones_in_the_physics(tmp_path):

@@ -70,6 +70,23 @@ def test_a_replay_is_bit_exact_and_is_written_beside_the_recording(solved):
     assert "bit-exact" in str(report) and json.loads(json.dumps(report.to_json()))["exact"] is True
 
 
+def test_the_wrist_s_images_are_replayed_and_compared_too(tmp_path):
+    env = TabletopEnv(BOWL, 1, image_size=32, cameras=("agentview", "wrist"), seed=0, max_steps=3, with_sim_state=True)
+    rollouts = record(tmp_path / "a.mcap", env)
+    env.close()
+    report = replay(tmp_path / "a.mcap")
+    assert report.exact is True and {"image", "wrist_image"} <= set(report.compared)
+    played = read_rollouts(report.target)[0]
+    assert torch.equal(played["next", "recorded", "wrist_image"], rollouts["next", *keys.WRIST_IMAGE][0])
+    changed = read_rollouts(tmp_path / "a.mcap")
+    changed["next", *keys.WRIST_IMAGE] = changed["next", *keys.WRIST_IMAGE].clone()
+    changed["next", *keys.WRIST_IMAGE][0, 1, 0, 5, 5] ^= 8
+    with RolloutWriter(tmp_path / "b.mcap", **provenance_of(tmp_path / "a.mcap")) as writer:
+        writer.write(changed)
+    report = replay(tmp_path / "b.mcap", write=False)
+    assert (report.first.step, report.first.field) == (2, "wrist_image") and report.psnr[2] < float("inf")
+
+
 def test_chunks_of_actions_replay_exactly_and_so_does_a_replay(tmp_path):
     env = chunked(TabletopEnv(TASKS, 4, image_size=32, seed=1, max_steps=12, with_sim_state=True), 8)
     record(tmp_path / "a.mcap", env)
@@ -115,6 +132,37 @@ def test_without_provenance_equality_is_not_claimed(tmp_path):
     report = replay(tmp_path / "a.mcap", write=False)
     assert report.exact is None and report.kind == "difference" and not report.divergences
     assert "equality is not claimed" in str(report) and any("does not describe its env" in n for n in report.notes)
+    assert any("'put the bowl on the plate' is taken for starter/put_the_bowl" in note for note in report.notes)
+
+
+def test_a_run_s_own_numbers_find_the_task_and_its_initial_state(tmp_path):
+    env = TabletopEnv(TASKS, 2, image_size=32, seed=0, max_steps=3, task_ids=(7, 3))
+    rollouts = record(tmp_path / "a.mcap", env)
+    env.close()
+    assert rollouts[keys.TASK_ID][:, 0, 0].tolist() == [7, 3]
+    assert len(read_rollouts(tmp_path / "a.mcap", task=TASKS[1])) == 1
+    for rollout in range(2):
+        report = replay(tmp_path / "a.mcap", rollout, write=False)
+        assert report.exact is True, str(report)
+
+
+def test_a_task_whose_digest_has_changed_is_named(solved, tmp_path):
+    about = provenance_of(solved)
+    about["metadata"]["digests"] = ["0" * 16, about["metadata"]["digests"][1]]
+    with RolloutWriter(tmp_path / "b.mcap", **about) as writer:
+        writer.write(read_rollouts(solved))
+    notes = [replay(tmp_path / "b.mcap", rollout, write=False).notes for rollout in (0, 1)]
+    assert any(f"the task {TASKS[0]} is not the one that was recorded: its digest was" in note for note in notes[0])
+    assert not notes[1]
+
+
+def test_a_recording_without_digests_is_replayed(solved, tmp_path):
+    about = provenance_of(solved)
+    del about["metadata"]["digests"], about["metadata"]["instructions"]
+    with RolloutWriter(tmp_path / "b.mcap", **about) as writer:
+        writer.write(read_rollouts(solved))
+    report = replay(tmp_path / "b.mcap", 1, write=False)
+    assert report.exact is True and not report.notes
 
 
 def test_nowhere_to_start_is_an_error(tmp_path):

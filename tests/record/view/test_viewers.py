@@ -75,6 +75,22 @@ def test_decisions_are_shown_step_by_step(decisions):
     assert shown.images["image"][0].tolist() == list(range(13))
 
 
+def test_every_camera_is_shown_with_what_was_recorded_of_it(steps, tmp_path):
+    target = replay(steps, 0, target=tmp_path / "w.mcap", edits=parse_edit("3 dx=1")).target
+    (shown,) = shown_rollouts(target)
+    assert list(shown.images) == ["image", "recorded/image", "wrist_image", "recorded/wrist_image", "action_map"]
+    entries = read_rollouts(steps, rollouts=0)[0]
+    count = len(shown.images["recorded/wrist_image"][1])
+    assert torch.equal(shown.images["recorded/wrist_image"][1][:9], entries["next", *keys.WRIST_IMAGE][:9])
+    assert shown.images["recorded/wrist_image"][0].tolist() == list(range(1, count + 1))
+    topics = {
+        panel["imageMode"]["imageTopic"]
+        for panel in foxglove_layout(target)["configById"].values()
+        if "imageMode" in panel
+    }
+    assert topics == {f"/{kind}/{name}" for kind in ("observation", "recorded") for name in ("image", "wrist_image")}
+
+
 def values_in(layout: dict) -> list[str]:
     return [line["value"] for panel in layout["configById"].values() for line in panel.get("paths", [])]
 

@@ -17,8 +17,6 @@ from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import TransformedEnv
 
-from worldenv_trl.keys import IMAGE
-
 if TYPE_CHECKING:
     from worldenv_trl.scenes import Task
 
@@ -43,15 +41,18 @@ def provenance(
     Keyword Args:
         models: what took part, by name (``policy``, ``world_model``, ``reflector``): their hashes are kept.
         config: settings, a dataclass or a dictionary.
-        tasks: of the rollouts, for an env that does not know its tasks (imagination).
+        tasks: of the rollouts, for an env that does not know its tasks (imagination); ``task_id`` is their place here.
         more: further plain values of the metadata, for instance ``seed=0``.
+
+    Raises:
+        ValueError: if two tasks have one ``task_id``.
 
     Returns:
         ``metadata``: ``versions`` of packages; ``threads`` of torch; ``models``, name -> :func:`model_hash`;
-        ``config``; ``tasks``, their names, and ``task_ids``; ``env``, its class and settings; ``calibration``, by task
-        and camera. ``attachments``:
-        for each task ``<k>.mjcf`` (the scene as text), ``<k>.mjb`` (the compiled scene, which the same version of
-        MuJoCo loads) and, for tasks of files, ``<k>.bddl``; k counts the tasks.
+        ``config``; ``tasks``, their names, with ``task_ids`` (what the entry ``task_id`` calls them), ``digests`` and
+        ``instructions``; ``env``, its class and settings; ``calibration``, by task and camera. ``attachments``: for
+        each task ``<k>.mjcf`` (the scene as text), ``<k>.mjb`` (the compiled scene, which the same version of MuJoCo
+        loads) and, for tasks of files, ``<k>.bddl``; k counts the tasks.
     """
     metadata: dict[str, Any] = {"versions": package_versions(), "threads": torch.get_num_threads()}
     attachments: dict[str, bytes] = {}
@@ -59,22 +60,25 @@ def provenance(
         metadata["models"] = {name: model_hash(model) for name, model in models.items()}
     if config is not None:
         metadata["config"] = _plain(config)
+    base, own = env, {}  # task_id by name
     if env is not None:
-        base = env
         transforms: list[str] = []
         while isinstance(base, TransformedEnv):
             transforms += [_described(part) for part in getattr(base.transform, "transforms", [base.transform])]
             base = base.base_env
         metadata["env"] = {"class": type(base).__name__, "transforms": transforms} | _settings(base)
-        tasks = tasks or getattr(base, "tasks", ())
+        shown = getattr(base, "tasks", ())
+        numbers = getattr(base, "task_ids", range(len(shown)))
+        own = {task.name: int(number) for task, number in zip(shown, numbers, strict=True)}
+        tasks = tasks or shown
     known = [_loaded(task) for task in tasks]
     if known:
-        size = getattr(base, "image_size", None) if env is not None else None
-        if size is None and env is not None:
-            size = base.observation_spec[IMAGE].shape[-1]
+        size = getattr(base, "image_size", 64)
         metadata["tasks"] = [task.name for task in known]
-        metadata["task_ids"] = [task.task_id for task in known]
-        metadata["calibration"] = {task.name: _calibration(task, size or 64) for task in known}
+        metadata["task_ids"] = _distinct([own.get(task.name, place) for place, task in enumerate(known)], known)
+        metadata["digests"] = [task.digest for task in known]
+        metadata["instructions"] = [task.language for task in known]
+        metadata["calibration"] = {task.name: _calibration(task, size) for task in known}
     for index, task in enumerate(known):
         attachments |= {f"{index}.{kind}": data for kind, data in _scene_files(task).items()}
     return {"metadata": metadata | _plain(more), "attachments": attachments}
@@ -86,6 +90,14 @@ def _loaded(task: str | Task) -> Task:
     from worldenv_trl.scenes import load_task  # builds on MuJoCo; reading alone does not need it
 
     return load_task(task)
+
+
+def _distinct(numbers: list[int], tasks: Sequence[Task]) -> list[int]:
+    for place, number in enumerate(numbers):
+        if number in numbers[:place]:
+            names = f"{tasks[numbers.index(number)].name} and {tasks[place].name}"
+            raise ValueError(f"task_id {number} would be both {names}: pass the env its task_ids")
+    return numbers
 
 
 def package_versions() -> dict[str, str]:
@@ -127,16 +139,20 @@ def _settings(env: EnvBase) -> dict[str, Any]:
 
 
 def _described(transform: Any) -> str:
-    names = ("chunk_length", "threshold", "consecutive", "num_frames")
-    settings = [f"{name}={getattr(transform, name)}" for name in names if getattr(transform, name, None) is not None]
+    rule = getattr(transform, "rule", None)  # when a reflector ends rollouts
+    settings = [f"{name}={value}" for name, value in dataclasses.asdict(rule).items()] if rule is not None else []
+    if getattr(transform, "chunk_length", None) is not None:
+        settings.append(f"chunk_length={transform.chunk_length}")
     return f"{type(transform).__name__}({', '.join(settings)})"
 
 
 def _calibration(task: Task, size_px: int) -> dict[str, Any]:
-    """Pinhole cameras: position (m), rotation (world from camera, looking along -z), vertical field of view (degrees)
+    """Pinhole cameras: ``mount``, the frame they are fixed in (``world``, or ``tool``, that of the tool centre),
+    position (m) and rotation (from the camera, which looks along -z) in that frame, vertical field of view (degrees)
     and the intrinsic matrix in pixels."""
     return {
         camera.name: {
+            "mount": camera.mount,
             "position": list(camera.position),
             "rotation": [list(row) for row in camera.rotation],
             "fovy": camera.fovy,

@@ -19,6 +19,7 @@ from worldenv_trl.record.mcap.arguments import check_arguments
 from worldenv_trl.record.mcap.file import PARTIAL_SUFFIX, REPAIRED_SUFFIX
 from worldenv_trl.record.mcap.part import Part
 from worldenv_trl.record.mcap.recording import TEXT, Recording, RolloutInfo
+from worldenv_trl.record.mcap.tasks import task_names, task_numbers
 
 __all__ = ["list_rollouts", "read_attachments", "read_metadata", "read_rollouts"]
 
@@ -299,13 +300,8 @@ def _text_entry(words: list[str], steps: int) -> NonTensorData | NonTensorStack:
 # ------------------------------------------------------------------------------------------------- tasks
 
 
-def _tasks(metadata: dict[str, Any]) -> list[str]:
-    named = metadata.get("tasks", metadata.get("task", []))
-    return [named] if isinstance(named, str) else list(named)
-
-
 def _require_task(path: Path, metadata: dict[str, Any], task: str) -> None:
-    tasks = _tasks(metadata)
+    tasks = task_names(metadata)
     if not tasks:
         raise ValueError(f"{path} does not say of which tasks it is: record it with metadata={{'tasks': [...]}}")
     if task not in tasks:
@@ -314,13 +310,12 @@ def _require_task(path: Path, metadata: dict[str, Any], task: str) -> None:
 
 def _task_id(recording: Recording, task: str) -> int | None:
     """The ``task_id`` of ``task`` in a file of several tasks; None if all its rollouts are of it."""
-    tasks = _tasks(recording.metadata)
+    tasks, numbers = task_names(recording.metadata), task_numbers(recording.metadata)
     if len(tasks) < 2:
         return None
-    numbers = recording.metadata.get("task_ids")
-    if numbers is None and recording.version < 3:
+    if numbers is None and recording.version < 3:  # they followed from a catalogue that has changed
         raise ValueError(f"{recording.path} names several tasks and not their task_ids: they cannot be told apart")
-    return tasks.index(task) if numbers is None else int(numbers[tasks.index(task)])
+    return tasks.index(task) if numbers is None else numbers[tasks.index(task)]
 
 
 def _of_task(parts: list[Part], task_id: int, path: Path) -> list[Part]:

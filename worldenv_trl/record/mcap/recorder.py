@@ -55,7 +55,8 @@ class Recorder(Transform):
         metadata, attachments, overwrite: see :class:`~worldenv_trl.record.RolloutWriter`.
         exclude: entries that are not recorded, before and after the step; the name of a nest leaves out all in it.
         kinematics: adds ``predicted_state`` to step-level rollouts with ``kinematic_state`` and ``action``.
-        action_map: adds ``action_map``; drawing it costs much more than everything else that is recorded.
+        action_map: of one camera, adds ``action_map``; drawing it costs much more than everything else that is
+            recorded.
         worker: replaces the worker's name, also outside of worker processes.
         queue_size: env steps that may wait to be written.
 

@@ -27,7 +27,6 @@ from worldenv_trl.keys import (
     STEP_MASK,
     SUCCESS,
     SUCCESS_PROB,
-    TASK_ID,
     TERMINATION,
     TERMINATIONS,
 )
@@ -296,7 +295,7 @@ class RolloutStream:
 
                 self._hand = ForwardKinematics()
             pose = self._hand.pose(after)
-            values["next", ACTION_MAP] = painted(self._action_map(pose, values.get(("next", TASK_ID))))
+            values["next", ACTION_MAP] = painted(self._action_map(pose, tool_pose=pose))
         ended = [values.get(("next", name)) for name in ("terminated", "truncated")]
         if None not in ended:
             values["next", TERMINATION] = self._causes(values, *ended)

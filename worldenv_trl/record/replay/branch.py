@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -14,6 +14,10 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from worldenv_trl.keys import ACTION_DIM, CHUNK
+
+if TYPE_CHECKING:
+    from worldenv_trl.envs import Reflect
+    from worldenv_trl.reflectors import StopRule
 
 __all__ = ["ACTION_NAMES", "Branch", "parse_edit"]
 
@@ -42,6 +46,13 @@ class Branch:
     @property
     def changes(self) -> bool:
         return bool(self.policy is not None or self.seed is not None or self.threshold is not None or self.edits)
+
+    def direct(self, reflect: Reflect | None, rule: StopRule | None, step: int) -> None:
+        """Sets how the action of env step ``step`` may end the rollout: before the branch not at all, then by ``rule``,
+        with the branch's threshold."""
+        if reflect is not None and rule is not None:
+            reflect.stops = step >= self.step
+            reflect.rule = rule if self.threshold is None else replace(rule, threshold=self.threshold)
 
     def edited(self, actions: Tensor, first: int) -> Tensor:
         """Actions [n, 7] of the steps from ``first`` on, with the edits."""

@@ -9,13 +9,13 @@ from tensordict import TensorDict
 from torchrl.envs.transforms import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from worldenv_trl.keys import ACTION, CONTEXT_ID, IMAGE, MASK, NUM_STEPS, SIM_STATE, STATE, TASK_ID, WRIST_IMAGE
+from worldenv_trl.keys import ACTION, CONTEXT_ID, MASK, NUM_STEPS, SIM_STATE, STATE, TASK_ID
 from worldenv_trl.record.replay.branch import Branch
 from worldenv_trl.record.replay.source import Source, recorded_task
 
 if TYPE_CHECKING:
     from worldenv_trl.envs import TabletopEnv
-    from worldenv_trl.reflectors import Reflector
+    from worldenv_trl.reflectors import Reflector, StopRule
 
 __all__ = ["replay_physics", "state_parts"]
 
@@ -25,7 +25,7 @@ def replay_physics(
     branch: Branch | None,
     from_step: int,
     reflector: Reflector | None,
-    rule: dict[str, float],
+    rule: StopRule | None,
     notes: list[str],
 ) -> tuple[TensorDict, int]:
     """Steps the physics with the recorded actions, or those of ``branch``.
@@ -33,12 +33,12 @@ def replay_physics(
     Returns:
         Step-level entries [T] and the env step that they begin at.
     """
-    from worldenv_trl.envs import Reflect
-
     env = base = _env_of(source, notes)
     reflect = None
     if reflector is not None:
-        reflect = Reflect(reflector, **rule)
+        from worldenv_trl.envs import Reflect
+
+        reflect = Reflect(reflector, rule)
         env = TransformedEnv(env, reflect)
     try:
         start, first = _start(source, base, from_step, notes)
@@ -53,16 +53,15 @@ def replay_physics(
 def _play(source: Source, env, td: TensorDict, first: int, branch: Branch | None, reflect) -> TensorDict:
     actions, until = source.actions, source.steps
     turn = until + 1 if branch is None else branch.step
-    threshold = None if reflect is None else reflect.threshold
+    rule = None if reflect is None else reflect.rule
     if branch is not None and branch.policy is not None:
         until = max(until, int(_innermost(env)._limit.max()))
     if branch is not None and branch.seed is not None:
         torch.manual_seed(branch.seed)
     entries, planned = [], []
     for step in range(first, until):
-        if reflect is not None and branch is not None:  # before the branch nothing may stop it
-            changed = threshold if branch.threshold is None else branch.threshold
-            reflect.threshold = changed if step >= turn else float("inf")
+        if branch is not None:
+            branch.direct(reflect, rule, step)
         if step >= turn and branch.policy is not None:
             planned = planned or list(branch.decide(td)[0])
             action = planned.pop(0).clamp(-1, 1)
@@ -85,20 +84,19 @@ def _env_of(source: Source, notes: list[str]) -> TabletopEnv:
     """The env of one row that the rollout was recorded in, as far as the file says."""
     from worldenv_trl.envs import TabletopEnv
 
-    have = set(source.entries.keys(True, True))
     known = source.env
     if not known:
         notes.append("the file does not describe its env: defaults are assumed (record with provenance(env))")
-    cameras = tuple(name for name, key in (("agentview", IMAGE), ("wrist", WRIST_IMAGE)) if key in have)
-    size = next((source.entries[key].shape[-1] for key in (IMAGE, WRIST_IMAGE) if key in have), 64)
+    cameras = tuple(dict.fromkeys((*known.get("cameras", ()), *source.cameras)))
     proprio = known.get("proprio") or _proprio_of(source)
     limit = known.get("max_steps") or source.steps
     limit = max(limit) if isinstance(limit, list) else int(limit)
     return TabletopEnv(
         recorded_task(source, notes),
         1,
-        image_size=size,
+        image_size=source.image_size or known.get("image_size", 64),
         cameras=cameras,
+        task_ids=(source.task_id or 0,),
         proprio=proprio,
         terminate_on_success=known.get("terminate_on_success", True),
         max_steps=max(limit, source.steps),

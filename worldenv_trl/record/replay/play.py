@@ -12,24 +12,24 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 
-from worldenv_trl.keys import CHUNK_LENGTH, FRAMES, IMAGE, MASK, SUCCESS, SUCCESS_PROB
+from worldenv_trl.keys import FRAMES, MASK, SUCCESS, SUCCESS_PROB
 from worldenv_trl.record.mcap.provenance import model_hash, package_versions
 from worldenv_trl.record.mcap.reader import list_rollouts, read_attachments, read_rollouts
 from worldenv_trl.record.mcap.recording import Recording
 from worldenv_trl.record.mcap.writer import RolloutWriter
 from worldenv_trl.record.replay.branch import Branch, check_edits
-from worldenv_trl.record.replay.imagination import chunks_of, replay_imagination
 from worldenv_trl.record.replay.physics import replay_physics, state_parts
 from worldenv_trl.record.replay.report import Divergence, ReplayReport, compare, frame_psnr
-from worldenv_trl.record.replay.source import Source, observed, open_rollout
+from worldenv_trl.record.replay.source import Source, image_entries, observed, open_rollout
 
 if TYPE_CHECKING:
-    from worldenv_trl.reflectors import Reflector
+    from worldenv_trl.reflectors import Reflector, StopRule
+    from worldenv_trl.world_models import WorldModel
 
 __all__ = ["replay"]
 
 MODES = ("physics", "imagination")
-_RULE = re.compile(r"(threshold|consecutive|num_frames)=([\d.eE+-]+)")
+_RULE = re.compile(r"(threshold|consecutive)=([\d.eE+-]+)")
 
 
 def replay(
@@ -37,7 +37,7 @@ def replay(
     rollout: int = 0,
     *,
     mode: str | None = None,
-    world_model: TensorDictModuleBase | None = None,
+    world_model: WorldModel | None = None,
     reflector: Reflector | None = None,
     from_step: int = 0,
     policy: TensorDictModuleBase | None = None,
@@ -66,7 +66,8 @@ def replay(
         mode: ``physics`` or ``imagination``; as recorded by default. The other one gives a difference curve.
         world_model: needed for imagination. If its hash is not the recorded one, differences are shown and equality
             is not claimed.
-        reflector: stops the replay by the recorded rule and scores it; only the frames are compared without.
+        reflector: stops the replay by the recorded rule (the paper's if the file does not say) and scores it; only the
+            frames are compared without.
         from_step: env step to begin at. Physics begins at the last recorded state that is not behind it; imagination
             branches at the decision that holds it.
         policy: an actor that acts from ``from_step`` on; greedy without ``seed``.
@@ -176,9 +177,11 @@ def _imagined(
     source: Source, branch: Branch | None, from_step: int, notes: list[str], **options
 ) -> tuple[TensorDict, TensorDict | None]:
     """The rollout in imagination; for a what-if also what happens there when nothing is changed."""
+    from worldenv_trl.record.replay.imagination import chunks_of, replay_imagination  # reading needs no world models
+
     world_model = options["world_model"]
-    length = getattr(world_model, "chunk_length", CHUNK_LENGTH)
-    rollouts = chunks_of(source, length)
+    length = world_model.chunk_length
+    rollouts = chunks_of(source, length, world_model.cameras)
     known = source.env.get("max_steps", source.steps) if source.imagined else source.steps
     options["max_steps"] = max(known) if isinstance(known, list) else max(int(known), source.steps)
     options["proprio"] = source.env.get("proprio", "commanded")
@@ -230,16 +233,15 @@ def _wave(source: Source) -> tuple[TensorDict, int, int] | None:
     return found[order], place % rows, batch[1]
 
 
-def _rule(source: Source, reflector: Reflector | None) -> dict[str, float]:
-    """The recorded stopping rule, else the reflector's own."""
+def _rule(source: Source, reflector: Reflector | None) -> StopRule | None:
+    """The recorded stopping rule, else the paper's."""
     if reflector is None:
-        return {}
+        return None
+    from worldenv_trl.reflectors import StopRule  # reading needs no reflectors
+
     described = next((text for text in source.env.get("transforms", []) if text.startswith("Reflect(")), "")
-    found = {name: float(value) for name, value in _RULE.findall(described)}
-    config = getattr(reflector, "config", None)
-    found.setdefault("threshold", getattr(config, "threshold", 0.5))
-    found.setdefault("consecutive", getattr(config, "consecutive", 1))
-    return {name: value if name == "threshold" else int(value) for name, value in found.items()}
+    found = dict(_RULE.findall(described))
+    return StopRule(float(found.get("threshold", StopRule.threshold)), int(found.get("consecutive", 1)))
 
 
 def _same_versions(source: Source, notes: list[str]) -> bool:
@@ -292,17 +294,19 @@ def _target(source: Source, mode: str, branch: Branch | None, target: str | os.P
 def _write(source, played: TensorDict, report: ReplayReport, recorded, target: Path, overwrite, models) -> None:
     """The replay as a recording, each step with its recorded image and the difference between both."""
     played = played.copy()
-    image = recorded.get("image")
-    if image is not None and ("next", *IMAGE) in played.keys(True, True):
-        steps, frames = image
-        chunk = played["next", FRAMES].shape[1] if ("next", FRAMES) in played.keys(True, True) else 1
+    have = played.keys(True, True)
+    for name in image_entries(played):
+        if name not in recorded or ("next", "observation", name) not in have:
+            continue
+        steps, images = recorded[name]
+        chunk = played["next", FRAMES, name].shape[1] if ("next", FRAMES, name) in have else 1
         shown = report.first_step + 1 + torch.arange(len(played) * chunk)  # the steps of the played images
-        place = torch.searchsorted(steps, shown).clamp(max=len(frames) - 1)
+        place = torch.searchsorted(steps, shown).clamp(max=len(images) - 1)
+        shape = (len(played),) if chunk == 1 else (len(played), chunk)
+        key = (name,) if chunk == 1 else (FRAMES, name)
+        played["next", "recorded", *key] = images[place].reshape(*shape, *images.shape[1:])
         # Equal frames have an infinite PSNR, which no viewer plots.
         psnr = torch.tensor([min(report.psnr.get(step, float("nan")), 100.0) for step in shown.tolist()])
-        name = "image" if chunk == 1 else "frames"
-        shape = (len(played),) if chunk == 1 else (len(played), chunk)
-        played["next", "recorded", name] = frames[place].reshape(*shape, *frames.shape[1:])
         played["next", "recorded", "psnr"] = psnr.reshape(len(played), chunk)
     imagined = report.mode == "imagination"
     described = dict(source.metadata) | {

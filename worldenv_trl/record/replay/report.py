@@ -37,7 +37,7 @@ class ReplayReport:
     ``exact`` is True only if everything was compared with the very models and every compared bit is the same, False if
     something differs, and None where equality is not claimed: a what-if, another model, or another kind of replay.
     ``divergences`` are the first of each field, earliest first. ``psnr`` is the difference curve: dB of each compared
-    frame by env step, infinite for equal frames.
+    frame, over the pixels of all cameras, by env step, infinite for equal frames.
     """
 
     source: Path
@@ -146,17 +146,20 @@ def compare(
 def frame_psnr(
     recorded: dict[str, tuple[Tensor, Tensor]], replayed: dict[str, tuple[Tensor, Tensor]]
 ) -> dict[int, float]:
-    """PSNR (dB) of each frame that both show, by env step."""
+    """PSNR (dB) of each frame that both show, over the pixels of all their cameras, by env step."""
     from worldenv_trl.metrics import psnr  # metrics may read recordings themselves
 
-    if "image" not in recorded or "image" not in replayed:
+    names = [name for name, (_, images) in recorded.items() if images.ndim == 4 and name in replayed]
+    names = [name for name in names if recorded[name][1].shape[1:] == replayed[name][1].shape[1:]]
+    found = [(_pairs(recorded[name][0], replayed[name][0], -1), name) for name in names]
+    found = [(pairs, name) for pairs, name in found if len(pairs) and torch.equal(pairs, found[0][0])]
+    if not found:
         return {}
-    (steps, left), (others, right) = recorded["image"], replayed["image"]
-    pairs = _pairs(steps, others, -1)
-    if not len(pairs) or left.shape[1:] != right.shape[1:]:
-        return {}
-    values = psnr(right[pairs[:, 1]], left[pairs[:, 0]])
-    return dict(zip(steps[pairs[:, 0]].tolist(), values.tolist(), strict=True))
+    pairs = found[0][0]
+    left = torch.cat([recorded[name][1][pairs[:, 0]] for _, name in found], -2)  # one below the other
+    right = torch.cat([replayed[name][1][pairs[:, 1]] for _, name in found], -2)
+    steps = recorded[found[0][1]][0][pairs[:, 0]]
+    return dict(zip(steps.tolist(), psnr(right, left).tolist(), strict=True))
 
 
 def _pairs(left: Tensor, right: Tensor, after: int) -> Tensor:

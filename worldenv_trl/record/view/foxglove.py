@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import re
@@ -14,12 +15,14 @@ from worldenv_trl.record.mcap.recording import Recording
 __all__ = ["foxglove_layout", "foxglove_paths"]
 
 _PATH = re.compile(r"(/[\w/]+)\.(\w+)(?:\[(\d+)\])?")
+_CAMERA = re.compile(r"(?:/layout_\d+)?/(observation|recorded)/.*(?<!/after_stop)$")
 
 
 def foxglove_layout(path: str | os.PathLike | None = None) -> dict[str, Any]:
     """The layout that ships with this package, as Foxglove imports it; for ``path``, what that recording holds of it.
 
-    Panels and plotted values of topics and fields that the recording lacks are left out, so that none shows an error.
+    Panels and plotted values of topics and fields that the recording lacks are left out, so that none shows an error;
+    cameras that the layout does not know get a panel, too.
 
     Raises:
         FileNotFoundError, ValueError: as :func:`~worldenv_trl.record.read_rollouts`.
@@ -29,6 +32,10 @@ def foxglove_layout(path: str | os.PathLike | None = None) -> dict[str, Any]:
         return layout
     have = foxglove_paths(path)
     panels = layout["configById"]
+    shown = {panel["imageMode"]["imageTopic"] for name, panel in panels.items() if name.startswith("Image!")}
+    for topic in sorted(have):
+        if _CAMERA.match(topic) and topic not in shown and not have[topic]:
+            _add_camera(layout, topic)
     for name, panel in list(panels.items()):
         kind = name.partition("!")[0]
         if kind == "Plot":
@@ -44,6 +51,24 @@ def foxglove_layout(path: str | os.PathLike | None = None) -> dict[str, Any]:
             del panels[name]
     layout["layout"] = _pruned(layout["layout"], set(panels))
     return layout
+
+
+def _add_camera(layout: dict[str, Any], topic: str) -> None:
+    """An image panel for a topic, beside the camera's."""
+    panel = copy.deepcopy(layout["configById"]["Image!camera"])
+    panel["foxglovePanelTitle"] = topic.strip("/").replace("observation/", "").replace("/", " ")
+    panel["imageMode"]["imageTopic"] = topic
+    name = "Image!" + re.sub(r"\W", "", topic)
+    layout["configById"][name] = panel
+    layout["layout"] = _beside(layout["layout"], "Image!camera", name)
+
+
+def _beside(tree: Any, panel: str, other: str) -> Any:
+    """The arrangement with another panel at the side of one."""
+    if isinstance(tree, str):
+        pair = {"first": panel, "second": other, "direction": "row", "splitPercentage": 50}
+        return pair if tree == panel else tree
+    return tree | {side: _beside(tree[side], panel, other) for side in ("first", "second")}
 
 
 def foxglove_paths(path: str | os.PathLike) -> dict[str, dict[str, int]]:

@@ -32,7 +32,7 @@ PLOTS = (
 _COLORS = np.array(  # told apart on dark and on light ground
     [[230, 80, 60], [70, 170, 80], [70, 130, 220], [240, 170, 50], [160, 90, 200], [60, 190, 200], [220, 120, 170]]
 )
-_VIEWS = (("image", "camera"), ("recorded", "recorded"), ("wrist_image", "wrist"), ("action_map", "action map"))
+_TITLES = {"image": "camera", "wrist_image": "wrist", "action_map": "action map"}  # else the camera's own name
 
 
 def rerun_recording(path: str | os.PathLike, rollouts: Sequence[int] | slice = slice(None)) -> Any:
@@ -67,9 +67,9 @@ def rerun_blueprint(shown: Sequence[Shown]) -> Any:
     require_rerun()
     import rerun.blueprint as rrb
 
-    images = {name for rollout in shown for name in rollout.images}
+    images = list(dict.fromkeys(name for rollout in shown for name in rollout.images))
     curves = {curve.name for rollout in shown for curve in rollout.curves}
-    cameras = [rrb.Spatial2DView(origin=f"/camera/{name}", name=title) for name, title in _VIEWS if name in images]
+    cameras = [rrb.Spatial2DView(origin=f"/camera/{name}", name=_title(name)) for name in images]
     plots = []
     for title, names in PLOTS:
         names = [name for name in names if name in curves]
@@ -91,6 +91,11 @@ def rerun_blueprint(shown: Sequence[Shown]) -> Any:
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
+
+
+def _title(image: str) -> str:
+    name = image.removeprefix("recorded/")
+    return ("recorded " if name != image else "") + _TITLES.get(name, name)
 
 
 def _send(rr: Any, stream: Any, rollout: Shown, named: set[str], gap: bool) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -17,6 +16,7 @@ from worldenv_trl.keys import (
     CHUNK,
     CONTROL_HZ,
     FRAMES,
+    IMAGE,
     INSTRUCTION,
     KINEMATIC_DIM,
     KINEMATIC_STATE,
@@ -30,8 +30,10 @@ from worldenv_trl.keys import (
 from worldenv_trl.record.mcap.reader import read_rollouts
 from worldenv_trl.record.mcap.recording import Recording
 from worldenv_trl.record.mcap.stream import painted
+from worldenv_trl.record.mcap.tasks import task_names, task_numbers
 from worldenv_trl.record.replay.branch import ACTION_NAMES
-from worldenv_trl.record.replay.source import observed
+from worldenv_trl.record.replay.source import image_entries, observed
+from worldenv_trl.robot import Camera
 
 __all__ = ["Curve", "Shown", "shown_rollouts"]
 
@@ -55,7 +57,8 @@ class Curve:
 class Shown:
     """One rollout for the eye; ``start`` is when it plays in its file (s), a step takes 1 / 20 s.
 
-    ``images``: name -> steps [n] and frames uint8 [n, 3, H, W]; ``states`` float [n, 7] after ``state_steps``.
+    ``images``: name -> steps [n] and frames uint8 [n, 3, H, W], for each camera and, in a replay, what was recorded of
+    it (``recorded/<name>``), and ``action_map``; ``states`` float [n, 7] after ``state_steps``.
     """
 
     number: int
@@ -96,15 +99,18 @@ def _file(path: str | os.PathLike):
 def _shown(entries: TensorDict, number: int, start: float, metadata: dict[str, Any]) -> Shown:
     seen = observed(entries)
     first = _steps(entries)[0]
-    images = {name: seen[name] for name in ("image", "wrist_image") if name in seen}
     have = set(entries.keys(True, True))
-    for name in ("image", "frames"):
+    images = {}
+    for name in image_entries(entries):
+        images[name] = seen[name]
         if ("next", "recorded", name) in have:
-            images["recorded"] = _per_step(entries, entries["next", "recorded", name], first)
+            images[f"recorded/{name}"] = _steps(entries)[1], entries["next", "recorded", name]
+        if ("next", "recorded", FRAMES, name) in have:
+            images[f"recorded/{name}"] = _per_step(entries, entries["next", "recorded", FRAMES, name], first)
     if ("next", ACTION_MAP) in have:
         images["action_map"] = _steps(entries)[1], entries["next", ACTION_MAP]
-    elif "kinematic_state" in seen and "image" in images:
-        drawn = _drawn(entries, seen["kinematic_state"][1], images["image"][1].shape[-1], metadata)
+    elif "kinematic_state" in seen and IMAGE[1] in images:
+        drawn = _drawn(entries, seen["kinematic_state"][1], images[IMAGE[1]][1].shape[-1], metadata)
         if drawn is not None:
             images["action_map"] = seen["kinematic_state"][0], drawn
     state_steps, states = seen.get("state", (torch.zeros(0, dtype=torch.int64), torch.zeros(0, 7)))
@@ -123,9 +129,7 @@ def _steps(entries: TensorDict) -> tuple[Tensor, Tensor]:
 
 
 def _per_step(entries: TensorDict, values: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
-    """Values [T, C, ...] of what was executed, with the steps after which they hold; [T, ...] of single steps, too."""
-    if ("next", STEP_MASK) not in entries.keys(True, True):
-        return first + 1, values
+    """Values [T, C, ...] of what was executed, with the steps after which they hold."""
     mask = entries["next", STEP_MASK]
     return (first.unsqueeze(-1) + 1 + torch.arange(mask.shape[1]))[mask], values[mask]
 
@@ -141,7 +145,7 @@ def _curves(entries: TensorDict) -> list[Curve]:
         if (path[0] != "next" and ("next", *path) in have) or below == MASK or below[-1] in _NUMBERS:
             continue
         value = entries[key]
-        if not isinstance(value, Tensor) or below[-1] in ("frames", "image", "wrist_image", ACTION_MAP):
+        if not isinstance(value, Tensor) or value.ndim > 3:  # an image
             continue
         chunked = length and value.ndim > 1 and value.shape[1] == length
         if chunked and (value.ndim == 3 or below[-1] in _PER_STEP):
@@ -174,7 +178,7 @@ def _outcome(entries: TensorDict, have: set) -> str:
     said = []
     if ("next", SUCCESS) in have:
         said.append("success" if bool(entries["next", SUCCESS][-1]) else "no success")
-    if ("next", FRAMES) in have and ("next", "terminated") in have:
+    if ("next", STEP_MASK) in have and ("next", "terminated") in have:
         said.append("stopped" if bool(entries["next", "terminated"][-1]) else "not stopped")
     return ", ".join(said)
 
@@ -183,12 +187,13 @@ def _drawn(entries: TensorDict, kinematic: Tensor, size: int, metadata: dict[str
     """The action maps uint8 [n, 3, H, W] of kinematic states, through the recorded camera."""
     if KINEMATIC_STATE not in entries.keys() or TASK_ID not in entries.keys():  # noqa: SIM118
         return None
-    number, known = int(entries[TASK_ID][0, 0]), metadata.get("task_ids", [])
-    cameras = metadata.get("calibration", {})
-    camera = cameras.get(metadata["tasks"][known.index(number)], {}).get("agentview") if number in known else None
-    if camera is None:
+    number, known = int(entries[TASK_ID][0, 0]), task_numbers(metadata) or []
+    task = task_names(metadata)[known.index(number)] if number in known else None
+    seen_by = metadata.get("calibration", {}).get(task, {}).get("agentview")
+    if seen_by is None:
         return None
     from worldenv_trl.kinematics import ActionMap, ForwardKinematics
 
+    camera = Camera("agentview", seen_by["position"], seen_by["rotation"], seen_by["fovy"])
     with torch.no_grad():
-        return painted(ActionMap(SimpleNamespace(**camera), size)(ForwardKinematics().pose(kinematic)))
+        return painted(ActionMap(camera, size)(ForwardKinematics().pose(kinematic)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import NonTensorStack, TensorDict
+from tensordict import NonTensorStack, TensorDict, is_leaf_nontensor
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import BaseCollector
@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, check_env_specs, exploration_typ
 
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.keys import CONTEXT_ID, INSTRUCTION, MASK
+from worldenv_trl.language import instructions_of
 from worldenv_trl.objectives import rloo_advantage
 
 
@@ -213,6 +214,12 @@ def test_weights_arrive_in_every_form():
         collector.update_policy_weights_(other, policy=other)
 
 
+def test_a_function_has_no_weights_to_update():
+    collector = make_collector(policy=lambda td: td.set("action", torch.zeros(2, 3, 2)))
+    with pytest.raises(ValueError, match="no weights"):
+        collector.update_policy_weights_(make_policy())
+
+
 def test_a_saved_collector_resumes_where_it_was():
     first = make_collector(total_groups=6)
     first.next()
@@ -231,6 +238,38 @@ def test_a_seed_fixes_env_and_samples():
         assert collector.env.seeded == 3
         batches.append(collector.next())
     assert torch.equal(batches[0]["action"], batches[1]["action"])
+
+
+def test_excluded_entries_are_in_no_step_and_nothing_else_changes():
+    torch.manual_seed(0)
+    policy = make_policy()
+    whole, part = (
+        make_collector(policy=policy, exclude=exclude).next()
+        for exclude in ((), ["count", ("next", "count"), ("next", INSTRUCTION)])
+    )
+    left_out = {"count", ("next", "count"), ("next", INSTRUCTION)}
+    names = set(whole.keys(True, True, is_leaf=is_leaf_nontensor))
+    assert set(part.keys(True, True, is_leaf=is_leaf_nontensor)) == names - left_out
+    for name in names - left_out - {INSTRUCTION}:
+        assert torch.equal(whole[name], part[name]), name
+    assert instructions_of(part) == instructions_of(whole)
+
+
+def test_what_is_excluded_can_change_from_batch_to_batch():
+    collector = make_collector()
+    collector.exclude = [("next", "count")]
+    assert ("next", "count") not in collector.next().keys(True)
+    collector.exclude = ()
+    assert ("next", "count") in collector.next().keys(True)
+    assert "_post_step_mdp_hooks" not in vars(collector.env)
+
+
+@pytest.mark.parametrize("name", ["next", ("next", "done"), ("next", "reward")])
+def test_what_the_collector_reads_cannot_be_excluded(name):
+    with pytest.raises(ValueError, match="must leave reward and done flags"):
+        make_collector(exclude=[name])
+    with pytest.raises(ValueError, match="must be a sequence"):
+        make_collector(exclude="count")
 
 
 def test_shutdown_closes_the_env_once_and_ends_the_collection():

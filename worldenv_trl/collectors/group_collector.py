@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, unravel_key
 from torch import nn
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from worldenv_trl import keys
+from worldenv_trl.policies import Policy, check_pairing
 
 __all__ = ["GroupCollector"]
+
+_READ = (("next", "reward"), ("next", "done"))  # by the collector itself
 
 
 class GroupCollector(BaseCollector):
@@ -29,7 +34,8 @@ class GroupCollector(BaseCollector):
 
     Args:
         env: batch ``[G, N]``, or a flat ``[G * N]`` with ``group_size=N`` (consecutive rows are a group).
-        policy: the behaviour policy; it must not change while a batch is collected.
+        policy: the behaviour policy; it must not change while a batch is collected. Every
+            :class:`~worldenv_trl.policies.Policy` in it is checked against the env.
 
     Keyword Args:
         groups_per_batch: groups in each yielded batch, a multiple of ``G``.
@@ -37,6 +43,8 @@ class GroupCollector(BaseCollector):
         group_size: see ``env``.
         max_decisions: longest rollout in env steps (decisions, for a chunked env); default 10,000.
         exploration_type: of the policy; ``DETERMINISTIC`` is greedy.
+        exclude: entries that no one reads, left out of every step as soon as it is over; none by default. See
+            :attr:`exclude`.
 
     Yields:
         TensorDict ``[groups, N, T]`` as ``env.rollout`` writes it, with ``("collector", "mask")`` bool [groups, N, T]:
@@ -44,11 +52,20 @@ class GroupCollector(BaseCollector):
         at each of its entries.
 
     Raises:
-        ValueError: if sizes do not divide or are below 1.
+        ValueError: if sizes do not divide or are below 1, a policy was trained for another env, or ``exclude`` names
+            reward or done flags.
 
     Examples:
-        >>> for batch in GroupCollector(env, actor, groups_per_batch=24, total_groups=240):
-        ...     advantage = rloo_advantage(batch["returns"][..., 0])
+        >>> from worldenv_trl.envs import TabletopEnv, chunked
+        >>> from worldenv_trl.objectives import rloo_advantage
+        >>> options = {"cameras": (), "max_steps": 16, "seed": 0}  # nothing is drawn
+        >>> env = chunked(TabletopEnv("starter/open_the_top_drawer", 6, group_repeats=3, **options))
+        >>> collector = GroupCollector(env, groups_per_batch=2, total_groups=4, group_size=3)  # random actions
+        >>> for batch in collector:
+        ...     print(batch.shape, rloo_advantage(batch["returns"][..., 0]).shape)
+        torch.Size([2, 3, 2]) torch.Size([2, 3])
+        torch.Size([2, 3, 2]) torch.Size([2, 3])
+        >>> collector.shutdown()
     """
 
     def __init__(
@@ -61,6 +78,7 @@ class GroupCollector(BaseCollector):
         group_size: int | None = None,
         max_decisions: int | None = None,
         exploration_type: ExplorationType = ExplorationType.RANDOM,
+        exclude: Sequence[NestedKey] = (),
     ) -> None:
         super().__init__()
         shape = tuple(env.batch_size)
@@ -79,7 +97,11 @@ class GroupCollector(BaseCollector):
             raise ValueError(f"total_groups must be -1 or a multiple of {groups_per_batch}, got {total_groups}")
         if max_decisions is not None and max_decisions < 1:
             raise ValueError(f"max_decisions must be at least 1, got {max_decisions}")
+        for module in policy.modules() if isinstance(policy, nn.Module) else ():
+            if isinstance(module, Policy):
+                check_pairing(module, env)
         self.env, self.policy = env, policy
+        self.exclude = exclude
         self.group_shape = shape
         self.groups_per_batch, self.total_groups = groups_per_batch, total_groups
         self.max_decisions = 10_000 if max_decisions is None else max_decisions
@@ -87,6 +109,25 @@ class GroupCollector(BaseCollector):
         self._groups = self._frames = 0
         self._iter = -1
         self.closed = False
+
+    @property
+    def exclude(self) -> tuple[NestedKey, ...]:
+        """Entries of a step that rollouts leave out; assign it to change the batches that follow.
+
+        Images are nearly all of a rollout's memory, twice: an observation of step t is the next one of step t - 1.
+        What LOOP never reads: ``("frames", ("next", "frames"), ("next", "observation"))``.
+        """
+        return self._exclude
+
+    @exclude.setter
+    def exclude(self, names: Sequence[NestedKey]) -> None:
+        if isinstance(names, str):
+            raise ValueError(f"exclude must be a sequence of entries, got {names!r}: write [{names!r}]")
+        exclude = tuple(unravel_key(name) for name in names)
+        for name in exclude:
+            if name == "next" or name in _READ:
+                raise ValueError(f"exclude must leave reward and done flags in, got {name!r}")
+        self._exclude = exclude
 
     def iterator(self) -> Iterator[TensorDictBase]:
         while self.total_groups == -1 or self._groups < self.total_groups:
@@ -105,7 +146,7 @@ class GroupCollector(BaseCollector):
             self.pre_collect_hook()
         waves = [self._wave() for _ in range(self.groups_per_batch // self.group_shape[0])]
         length = max(wave.shape[-1] for wave in waves)
-        batch = waves[0] if len(waves) == 1 else torch.cat([_padded(wave, length) for wave in waves], 0)
+        batch = waves[0] if len(waves) == 1 else TensorDict.cat([_padded(wave, length) for wave in waves], 0)
         self._groups += self.groups_per_batch
         self._frames += int(batch[keys.MASK].sum())
         self._iter += 1
@@ -120,7 +161,7 @@ class GroupCollector(BaseCollector):
         try:
             for module in training:
                 module.training = False
-            with set_exploration_type(self.exploration_type):
+            with set_exploration_type(self.exploration_type), _leaving_out(self.env, self.exclude):
                 rollout = self.env.rollout(
                     self.max_decisions, self.policy, break_when_any_done=False, break_when_all_done=True
                 )
@@ -148,6 +189,8 @@ class GroupCollector(BaseCollector):
             raise ValueError("give the weights once: positionally, as weights=..., or as policy=...")
         if not given or given[0] is self.policy:
             return
+        if not isinstance(self.policy, nn.Module):
+            raise ValueError("the policy is a function: it has no weights to update")
         if isinstance(given[0], TensorDictBase):
             TensorDict.from_module(self.policy).data.update_(given[0].data)
         else:
@@ -178,6 +221,29 @@ class GroupCollector(BaseCollector):
         self.closed = True
         if close_env:  # is_closed is no guide: it is True from the start for envs that do not set it
             self.env.close(raise_if_closed=False)
+
+
+@contextmanager
+def _leaving_out(env: EnvBase, names: tuple[NestedKey, ...]) -> Iterator[None]:
+    """While it lasts, rollouts of ``env`` drop these entries of a step once the next one has been prepared."""
+    if not names:
+        yield
+        return
+    # The hook by which TorchRL lets transient entries be dropped before steps are stacked.
+    before, own = env._post_step_mdp_hooks, "_post_step_mdp_hooks" in vars(env)
+
+    def drop(step: TensorDictBase, following: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        if before is not None:
+            step, following = before(step, following)
+        return step.exclude(*names), following
+
+    env._post_step_mdp_hooks = drop
+    try:
+        yield
+    finally:
+        del env._post_step_mdp_hooks  # the class's shows again
+        if own:
+            env._post_step_mdp_hooks = before
 
 
 def _padded(wave: TensorDictBase, length: int) -> TensorDictBase:
