@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
-
-# TorchRL deprecates classes of its own when its collectors are imported; every recipe imports this module first.
-warnings.filterwarnings("ignore", message="Creating .*WeightUpdater")
 
 GOAL_TASKS = (
     "starter/put_the_bowl_on_the_plate",
@@ -65,8 +61,9 @@ class WorldModel:
     """Share of updates in which the second chunk is generated from the model's own first chunk."""
     failure_share: float | None = 0.6
     """Share of the windows, in every task, that come from episodes that fail; None draws from all episodes alike."""
-    frames_per_chunk: int | None = None
-    """Frames of each chunk that are painted and scored in an update; all if None."""
+    patch: int = 4
+    """Pixels per cell of the network's finest grid: twice the image at twice the patch costs the trunk nothing."""
+    width: int = 96
     denoise_steps: int = 1
     deterministic: bool = True
     """One step from zero noise; set to False to sample with ``denoise_steps`` steps."""
@@ -147,7 +144,9 @@ class WorldEnvConfig:
     num_threads: int = 2
     """CPU threads. Beside other jobs 1 is faster: threads that wait for a busy core make all wait."""
     tasks: tuple[str, ...] = GOAL_TASKS
-    """``suite/name``, each once."""
+    """``suite/name``, each once; ``task_id`` is the place in this list."""
+    cameras: tuple[str, ...] = ("agentview",)
+    """Cameras that every part sees through: ``agentview``, ``wrist`` and any other that the scenes have."""
     image_size: int = 64
     chunk_length: int = 8
     max_steps: int = 72

@@ -8,21 +8,22 @@ from __future__ import annotations
 import torch
 from tqdm import tqdm
 
-from config import WorldEnvConfig
-from parts import recording, seed_everything, tabletop
-from run_folder import RunFolder
+from physics import recording, tabletop
+from run import Run
+from stages import run_alone
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import ExpertPolicy
 from worldenv_trl.record import RolloutWriter
 
 
-def run(config: WorldEnvConfig, folder: RunFolder) -> None:
+def demonstrate(run: Run) -> None:
     """Writes ``rollouts/demonstrations.mcap``; raises ``RuntimeError`` if the expert fails one."""
-    seed_everything(config, offset=0)
+    config, folder = run.config, run.folder
+    run.seed_everything(offset=0)
     count = config.demonstrate.episodes_per_task
     options = {"init_state_mode": "cycle", "terminate_on_success": True, "with_sim_state": True}
-    described = tabletop(config, "train", count, config.tasks[:1], **options)
+    described = tabletop(config, "train", len(config.tasks), None, **options)
     about = recording(config, described, "demonstrate")
     described.close()
     with RolloutWriter(folder.rollouts("demonstrations"), **about, overwrite=True) as writer:
@@ -52,6 +53,4 @@ def check_solved(task: str, solved: torch.Tensor) -> None:
 
 
 if __name__ == "__main__":
-    from world_env import run_single
-
-    run_single("demonstrate")
+    run_alone("demonstrate", demonstrate)

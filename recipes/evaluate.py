@@ -9,41 +9,43 @@ from __future__ import annotations
 
 import torch
 
-from config import WorldEnvConfig
-from outcomes import outcomes_env, physics_outcomes
-from parts import load_policy, load_reflector, recording, seed_everything
+from outcomes import Judge, outcomes_env, physics_outcomes
+from physics import recording
+from run import Run
 from run_folder import RunFolder
+from stages import run_alone
 from worldenv_trl.metrics import paired_test, wilson_interval
 from worldenv_trl.policies import laplace_actor
 from worldenv_trl.record import RolloutWriter
 
 
-def run(config: WorldEnvConfig, folder: RunFolder, before: str, after: str, models: str | None) -> None:
+def evaluate(run: Run, before: str, after: str, models: str | None) -> None:
     """Evaluates checkpoints ``before`` and ``after`` on the same held-out initial states.
 
     Without ``models`` there is no reflector, and its protocol is left out.
     """
-    seed_everything(config, offset=90)
-    reflector = None if models is None else load_reflector(folder, models)
+    config, folder = run.config, run.folder
+    run.seed_everything(offset=90)
+    reflector = None if models is None else Judge(run.reflector(models), run.rules(models)["real"])
     for protocol in ("physics",) if reflector is None else ("physics", "reflector"):
         outcomes: dict[str, dict[str, torch.Tensor]] = {}
         for name in (before, after):
-            policy = load_policy(folder, name, "post_train")
+            policy = run.policy(name, "post_train")
             actor = laplace_actor(policy)
             judge = reflector if protocol == "reflector" else None
-            described = outcomes_env(config, config.tasks[0], "test", 1, judge, with_sim_state=True)
-            models = {"policy": policy} | ({} if judge is None else {"reflector": judge})
-            about = recording(config, described, "evaluate", models, policy=name, protocol=protocol)
+            described = outcomes_env(run, config.tasks[0], "test", 1, judge, with_sim_state=True)
+            taking_part = {"policy": policy} | ({} if judge is None else {"reflector": judge.reflector})
+            about = recording(config, described, "evaluate", taking_part, policy=name, protocol=protocol)
             described.close()
             with RolloutWriter(folder.rollouts(f"evaluate_{protocol}_{name}"), **about, overwrite=True) as writer:
                 outcomes[name] = {
                     task: physics_outcomes(
-                        config,
+                        run,
                         actor,
                         task,
                         "test",
                         config.evaluate.episodes_per_task,
-                        reflector=judge,
+                        judge=judge,
                         writer=writer,
                         label=f"{name}, {protocol} stops",
                     )
@@ -76,6 +78,4 @@ def _log(folder: RunFolder, protocol: str, policy: str, task: str, success: torc
 
 
 if __name__ == "__main__":
-    from world_env import run_single
-
-    run_single("evaluate")
+    run_alone("evaluate", evaluate)

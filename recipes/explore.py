@@ -7,19 +7,19 @@ from __future__ import annotations
 
 from tqdm import tqdm
 
-from config import WorldEnvConfig
-from parts import chunk_player, exploring_actor, load_policy, recording, seed_everything, step_env
-from run_folder import RunFolder
+from physics import chunk_player, exploring_actor, recording, step_env
+from run import Run
+from stages import run_alone
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.record import RolloutWriter
 
 
-def run(config: WorldEnvConfig, folder: RunFolder, policy: str = "sft", target: str = "explore") -> None:
+def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
     """Rolls checkpoint ``policy`` on the training initial states; writes ``rollouts/<target>.mcap``."""
-    settings = config.explore
-    seed_everything(config, offset=20 + len(target))
-    model = load_policy(folder, policy, "sft").eval()
+    config, folder, settings = run.config, run.folder, run.config.explore
+    run.seed_everything(offset=20 + len(target))
+    model = run.policy(policy, "sft").eval()
     per_scale = -(-settings.episodes_per_task * len(config.tasks) // len(settings.scale_factors))
     waves = -(-per_scale // settings.num_envs)
     # After success the rollout goes on: the models must see what undoes it (World-Env Figure 6).
@@ -52,6 +52,4 @@ def run(config: WorldEnvConfig, folder: RunFolder, policy: str = "sft", target: 
 
 
 if __name__ == "__main__":
-    from world_env import run_single
-
-    run_single("explore")
+    run_alone("explore", explore)

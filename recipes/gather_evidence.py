@@ -8,52 +8,55 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from torch import Tensor
 
 from config import WorldEnvConfig
-from parts import load_policy, load_reflector, load_world_model
+from parts import COMPACT, Parts, instructions
+from run import Run
 from run_folder import RunFolder
-from two_worlds import TwoWorlds, first_success, honesty_of, imagine, judged, live, relive
+from two_worlds import TwoWorlds, honesty_of, imagine, live, relive
 from worldenv_trl import keys
-from worldenv_trl.data import episodes_from_rollouts
-from worldenv_trl.metrics import advantage_correlation, honesty, moving_pixel_psnr
+from worldenv_trl.data import Episodes, episodes_from_rollouts
+from worldenv_trl.metrics import advantage_correlation, first_success, honesty, judged, moving_pixel_psnr
 from worldenv_trl.policies import laplace_actor
 from worldenv_trl.record import read_rollouts
-from worldenv_trl.reflectors import CompactReflector
+from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.report import Clip, Evidence, RunRecord, choose_clips, count_kinds
 from worldenv_trl.scenes import load_task
-from worldenv_trl.world_models import VideoWorldModel
+from worldenv_trl.world_models import WorldModel
 
 
-def gather(record: RunRecord, episodes_per_task: int, clips_per_kind: int, num_threads: int) -> Evidence:
+def gather(
+    record: RunRecord, episodes_per_task: int, clips_per_kind: int, num_threads: int, parts: Parts = COMPACT
+) -> Evidence:
     """Everything that needs the run's models; what cannot be had is named in ``missing``.
 
     Raises:
         FileNotFoundError: for a checkpoint that is missing, naming the stage that makes it.
-        ValueError: for tasks that this release does not have, or has under other numbers than the models.
+        ValueError: for tasks that this release does not have, or whose instructions the models were not trained on.
     """
-    folder, config = RunFolder(record.path), read_config(record, num_threads)
+    config = read_config(record, num_threads)
+    run = Run(config, RunFolder(record.path), parts)
     models = [path.name for path in sorted((record.path / "checkpoints").glob("reflector*")) if path.is_dir()]
     suffix = models[-1].removeprefix("reflector") if models else ""
-    world_model, reflector = load_world_model(folder, suffix), load_reflector(folder, suffix)
+    world_model, reflector, rules = run.world_model(suffix), run.reflector(suffix), run.rules(suffix)
     _check_tasks(record, config, world_model, reflector)
-    policies = [name for name in ("sft", f"post_train{suffix}") if folder.checkpoint(name).is_dir()]
+    policies = [name for name in ("sft", f"post_train{suffix}") if run.folder.checkpoint(name).is_dir()]
     if not policies:
         raise FileNotFoundError("there is no checkpoint of a policy: run the stage 'sft' first")
     missing = [] if len(policies) == 2 else ["the stage post_train has not finished: the policy before it is shown"]
     worlds: dict[str, TwoWorlds] = {}
     for name in policies:
         print(f"{name}: {episodes_per_task} held-out episodes a task, in the physics and in imagination")
-        actor = laplace_actor(load_policy(folder, name, name).eval())
-        worlds[name] = imagine(world_model, reflector, live(config, actor, episodes_per_task))
-    rules = reflector.config
+        actor = laplace_actor(run.policy(name, name).eval())
+        worlds[name] = imagine(run, world_model, reflector, rules, live(run, actor, episodes_per_task))
     waves = []
     for path in _waves(record, suffix):
         try:
-            waves += _relived(config, path)
+            waves += _relived(run, path)
         except ValueError as error:
             missing.append(f"the wave {path.name} cannot be replayed: {short(error)}")
-    shown = [clip for name in reversed(policies) for clip in clips(worlds[name], name, config, rules.threshold)]
+    shown = [clip for name in reversed(policies) for clip in clips(worlds[name], name, config, rules["imagined"])]
     return Evidence(
         clips=choose_clips(shown, clips_per_kind),
         counts={name: count_kinds(shown, name) for name in policies},
@@ -61,10 +64,7 @@ def gather(record: RunRecord, episodes_per_task: int, clips_per_kind: int, num_t
         waves=waves,
         drift={name: honesty_of(worlds[name])["drift"] for name in policies},
         scores=_frame_scores(list(worlds.values())),
-        rules={
-            "real": (rules.real_threshold, rules.real_consecutive),
-            "imagined": (rules.threshold, rules.consecutive),
-        },
+        rules={name: (rule.threshold, rule.consecutive) for name, rule in rules.items()},
         episodes=len(worlds[policies[-1]].episodes),
         missing=missing,
         notes=[
@@ -77,17 +77,14 @@ def gather(record: RunRecord, episodes_per_task: int, clips_per_kind: int, num_t
     )
 
 
-def _check_tasks(
-    record: RunRecord, config: WorldEnvConfig, world_model: VideoWorldModel, reflector: CompactReflector
-) -> None:
-    """The models must know the tasks of the run by the numbers that this release gives them."""
-    numbers = {task: load_task(task).task_id for task in config.tasks}
-    known = {int(number) for number in world_model.config.cameras} & set(range(reflector.config.num_tasks))
-    if strange := [f"{task} (number {number})" for task, number in numbers.items() if number not in known]:
-        raise ValueError(
-            f"the models of this run do not know {', '.join(strange)}: task names or numbers have changed since. "
-            f"{_remedy(record)}"
-        )
+def _check_tasks(record: RunRecord, config: WorldEnvConfig, world_model: WorldModel, reflector: Reflector) -> None:
+    """The models must have been trained on what the tasks of this release ask for."""
+    for part in (world_model, reflector):
+        if part.instructions and (strange := sorted(set(instructions(config)) - set(part.instructions))):
+            raise ValueError(
+                f"the models of this run do not know {', '.join(map(repr, strange))}: the tasks have changed since. "
+                f"{_remedy(record)}"
+            )
 
 
 def _remedy(record: RunRecord) -> str:
@@ -123,17 +120,18 @@ def _filled(settings: Any, values: dict[str, Any]) -> Any:
     return dataclasses.replace(settings, **found)
 
 
-def clips(worlds: TwoWorlds, policy: str, config: WorldEnvConfig, threshold: float) -> list[Clip]:
-    """Every episode of a policy, in both worlds."""
-    names = {load_task(task).task_id: task for task in config.tasks}
-    frames, out = worlds.episodes["frames"], []
+def clips(worlds: TwoWorlds, policy: str, config: WorldEnvConfig, rule: StopRule) -> list[Clip]:
+    """Every episode of a policy, in both worlds, its cameras one above the other."""
+    out = []
     for row in range(len(worlds.episodes)):
         steps = int(worlds.episodes["length"][row]) + 1
-        real, imagined = frames[row, :steps], worlds.imagined_frames[row, :steps]
+        real, imagined = (
+            _film(each, row, steps, worlds.imagined.cameras) for each in (worlds.episodes, worlds.imagined)
+        )
         psnr = moving_pixel_psnr(imagined, real, real[:1].expand_as(real)).clamp(max=60)
         out.append(
             Clip(
-                task=names[int(worlds.episodes[keys.TASK_ID][row])].split("/")[-1].replace("_", " "),
+                task=config.tasks[int(worlds.episodes[keys.TASK_ID][row])].split("/")[-1].replace("_", " "),
                 policy=policy,
                 context_id=int(worlds.episodes[keys.CONTEXT_ID][row]),
                 real_frames=real,
@@ -144,10 +142,16 @@ def clips(worlds: TwoWorlds, policy: str, config: WorldEnvConfig, threshold: flo
                 moving_psnr=psnr,
                 reached=int(worlds.reached[row]),
                 imagined_stop=int(worlds.imagined_stop[row]),
-                threshold=threshold,
+                threshold=rule.threshold,
             )
         )
     return out
+
+
+def _film(episodes: Episodes, row: int, steps: int, cameras: tuple[str, ...]) -> Tensor:
+    """uint8 [steps, 3, V H, W]."""
+    frame = torch.arange(steps)
+    return torch.cat([episodes.frames(camera, torch.full_like(frame, row), frame) for camera in cameras], -2)
 
 
 def _honesty_rows(worlds: TwoWorlds, policy: str, config: WorldEnvConfig) -> list[dict[str, Any]]:
@@ -164,9 +168,9 @@ def _honesty_rows(worlds: TwoWorlds, policy: str, config: WorldEnvConfig) -> lis
     return rows
 
 
-def _by_task(episodes: TensorDict, config: WorldEnvConfig) -> list[tuple[str, torch.Tensor]]:
+def _by_task(episodes: Episodes, config: WorldEnvConfig) -> list[tuple[str, torch.Tensor]]:
     number = episodes[keys.TASK_ID].squeeze(-1)
-    rows = {task: number == load_task(task).task_id for task in config.tasks}
+    rows = {task: number == place for place, task in enumerate(config.tasks)}
     return [("all", torch.ones_like(number, dtype=torch.bool)), *((t, r) for t, r in rows.items() if bool(r.any()))]
 
 
@@ -175,8 +179,9 @@ def _waves(record: RunRecord, suffix: str) -> list[Path]:
     return sorted((record.path / "rollouts").glob(f"post_train{suffix}_[0-9][0-9][0-9].mcap"))
 
 
-def _relived(config: WorldEnvConfig, path: Path) -> list[dict[str, Any]]:
+def _relived(run: Run, path: Path) -> list[dict[str, Any]]:
     """Honesty of a wave of imagined rollouts, whose actions are executed in the physics."""
+    config = run.config
     if config.post_train.env != "imagined":
         return []
     rollouts = read_rollouts(path)
@@ -184,7 +189,7 @@ def _relived(config: WorldEnvConfig, path: Path) -> list[dict[str, Any]]:
     episodes = episodes_from_rollouts(rollouts)
     stopped = (rollouts["next", "terminated"].squeeze(-1) & rollouts[keys.MASK]).any(-1).flatten()
     stop = torch.where(stopped, episodes["length"].squeeze(-1), -1)
-    reached = first_success(relive(config, episodes))
+    reached = first_success(relive(run, episodes))
     imagined, real = judged(stop, reached)
     returns = rollouts["returns"][..., 0].flatten()  # [G, N, T] holds the same at every decision
     rows = []
@@ -204,7 +209,7 @@ def _frame_scores(worlds: list[TwoWorlds]) -> dict[str, tuple[torch.Tensor, torc
     for name in ("real", "imagined"):
         parts = []
         for each in worlds:
-            alive = torch.arange(each.real_scores.shape[1]) <= each.episodes["length"]
+            alive = each.episodes.alive
             alive[:, 0] = False
             parts.append((getattr(each, f"{name}_scores")[alive], each.episodes["success"][alive]))
         out[name] = torch.cat([score for score, _ in parts]), torch.cat([label for _, label in parts])

@@ -3,50 +3,58 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict
 from torchrl.envs.transforms import TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
-from config import WorldEnvConfig
-from parts import imagined_env, stopping_rule, tabletop
+from imagination import Imagination
+from physics import tabletop
+from run import Run
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
-from worldenv_trl.envs import chunked, context_id
+from worldenv_trl.envs import Reflect, chunked, context_id
 from worldenv_trl.record import RolloutWriter
-from worldenv_trl.reflectors import CompactReflector
+from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.scenes import load_task
-from worldenv_trl.world_models import VideoWorldModel
+
+
+@dataclass(frozen=True)
+class Judge:
+    """A reflector in front of real cameras, and when it stops a rollout there."""
+
+    reflector: Reflector
+    rule: StopRule
 
 
 def physics_outcomes(
-    config: WorldEnvConfig,
+    run: Run,
     actor,
     task: str,
     split: str,
     episodes: int,
     *,
     indices: Sequence[int] | None = None,
-    reflector: CompactReflector | None = None,
+    judge: Judge | None = None,
     writer: RolloutWriter | None = None,
     label: str = "",
 ) -> torch.Tensor:
     """Success bool ``[episodes]`` of the first initial states of a split, or of those at ``indices``, in order.
 
-    The goal predicate ends an episode, or, with a ``reflector``, the reflector alone does: then success is whether the
+    The goal predicate ends an episode, or, with a ``judge``, the reflector alone does: then success is whether the
     goal holds in the moment it stops (or at the step limit).
     """
     options = {"init_state_count": episodes}
     if indices is not None:  # these initial states of the split only
-        task_id, episodes = load_task(task).task_id, len(indices)
+        task_id, episodes = run.config.tasks.index(task), len(indices)
         options = {
             "init_states": load_task(task).init_states(split, max(indices) + 1)[list(indices)],
             "context_ids": [context_id(task_id, split, index) for index in indices],
         }
-    num_envs = min(config.evaluate.num_envs, episodes)
-    env = outcomes_env(config, task, split, num_envs, reflector, with_sim_state=writer is not None, **options)
+    num_envs = min(run.config.evaluate.num_envs, episodes)
+    env = outcomes_env(run, task, split, num_envs, judge, with_sim_state=writer is not None, **options)
     waves = -(-episodes // num_envs)
     collector = GroupCollector(
         env,
@@ -70,22 +78,18 @@ def physics_outcomes(
     return torch.tensor([outcome[number] for number in sorted(outcome)][:episodes])
 
 
-def outcomes_env(
-    config: WorldEnvConfig, task: str, split: str, num_envs: int, reflector: CompactReflector | None, **options
-) -> TransformedEnv:
-    """Initial states in order; the goal predicate ends an episode or, with a ``reflector``, the reflector alone."""
-    options = {"init_state_mode": "cycle", "terminate_on_success": reflector is None} | options
-    env = tabletop(config, split, num_envs, [task], **options)
-    if reflector is not None:
-        env = TransformedEnv(env, stopping_rule(reflector, real=True))
-    return chunked(env, config.chunk_length)
+def outcomes_env(run: Run, task: str, split: str, num_envs: int, judge: Judge | None, **options) -> TransformedEnv:
+    """Initial states in order; the goal predicate ends an episode or, with a ``judge``, the reflector alone."""
+    options = {"init_state_mode": "cycle", "terminate_on_success": judge is None} | options
+    env = tabletop(run.config, split, num_envs, [task], **options)
+    if judge is not None:
+        env = TransformedEnv(env, Reflect(judge.reflector, judge.rule))
+    return chunked(env, run.config.chunk_length)
 
 
-def imagined_outcomes(
-    config: WorldEnvConfig, actor, world_model: VideoWorldModel, reflector: CompactReflector, contexts: TensorDict
-) -> torch.Tensor:
+def imagined_outcomes(run: Run, actor, imagination: Imagination, contexts) -> torch.Tensor:
     """Whether the reflector stops the greedy policy in imagination, bool ``[K]``, for each context in order."""
-    env = imagined_env(config, world_model, reflector, contexts, [len(contexts), 1])
+    env = imagination.env(run, [len(contexts), 1], contexts)
     collector = GroupCollector(
         env,
         actor,
@@ -100,28 +104,21 @@ def imagined_outcomes(
     return torch.tensor([order[number] for number in contexts[keys.CONTEXT_ID].squeeze(-1).tolist()])
 
 
-def greedy_outcomes(
-    config: WorldEnvConfig,
-    actor,
-    world_model: VideoWorldModel,
-    reflector: CompactReflector,
-    contexts: TensorDict,
-    per_task: int,
-) -> tuple[torch.Tensor, torch.Tensor]:
+def greedy_outcomes(run: Run, actor, imagination: Imagination, per_task: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Greedy success on up to ``per_task`` training contexts of every task: ``(real, imagined)``, bool ``[K]``.
 
     They are spread over all contexts: the first ones are the demonstrations' own.
     """
+    config, contexts = run.config, imagination.contexts
     numbers = contexts[keys.CONTEXT_ID].squeeze(-1)
     chosen, real = [], []
-    for task in config.tasks:
-        first = context_id(load_task(task).task_id, "train", 0)
+    for place, task in enumerate(config.tasks):
+        first = context_id(place, "train", 0)
         rows = ((numbers >= first) & (numbers < first + config.train_states)).nonzero().squeeze(-1)
         if len(rows):
             rows = rows[torch.linspace(0, len(rows) - 1, min(per_task, len(rows))).long()]
             indices = (numbers[rows] - first).tolist()
-            outcome = physics_outcomes(config, actor, task, "train", len(indices), indices=indices)
+            outcome = physics_outcomes(run, actor, task, "train", len(indices), indices=indices)
             chosen.append(rows)
             real.append(outcome)
-    chosen = torch.cat(chosen)
-    return torch.cat(real), imagined_outcomes(config, actor, world_model, reflector, contexts[chosen])
+    return torch.cat(real), imagined_outcomes(run, actor, imagination, contexts[torch.cat(chosen)])

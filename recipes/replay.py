@@ -13,19 +13,18 @@ from __future__ import annotations
 
 import json
 import sys
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
 from command_line import one_line_errors
-from worldenv_trl.policies import OFTPolicy, laplace_actor
-from worldenv_trl.pretrained import CONFIG_NAME
+from parts import COMPACT, Part, Parts
+from worldenv_trl.policies import laplace_actor
 from worldenv_trl.record import model_hash, parse_edit, read_metadata, replay
-from worldenv_trl.record.replay_source import open_rollout
-from worldenv_trl.reflectors import CompactReflector
-from worldenv_trl.world_models import VideoWorldModel
+from worldenv_trl.record.replay.source import open_rollout
+
+_NAMES = {"policy": ("sft", "post_train*"), "world_model": ("world_model*",), "reflector": ("reflector*",)}
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class Options:
 
 
 @one_line_errors
-def main(options: Options) -> int:
+def main(options: Options, parts: Parts = COMPACT) -> int:
     if options.json is not None and str(options.json) != "-" and options.json.exists() and not options.overwrite:
         raise FileExistsError(f"{options.json} exists: pass --overwrite or another name")
     if options.threshold is not None and not 0 < options.threshold < 1:
@@ -71,7 +70,7 @@ def main(options: Options) -> int:
     reflector = options.reflector or ("recorded" if options.threshold is not None else None)
     policy = None
     if options.policy is not None:
-        policy = laplace_actor(_checkpoint(OFTPolicy, options.policy, options.file, metadata, "policy"))
+        policy = laplace_actor(_checkpoint(parts.policy, options.policy, options.file, metadata, "policy"))
     edits: dict[int, dict[int, float]] = {}
     for text in options.edit:
         for step, values in parse_edit(text).items():
@@ -80,12 +79,12 @@ def main(options: Options) -> int:
         options.file,
         options.rollout,
         mode=options.mode,
-        world_model=_checkpoint(VideoWorldModel, options.world_model, options.file, metadata, "world_model")
+        world_model=_checkpoint(parts.world_model, options.world_model, options.file, metadata, "world_model")
         if imagined
         else None,
         reflector=None
         if reflector is None
-        else _checkpoint(CompactReflector, reflector, options.file, metadata, "reflector"),
+        else _checkpoint(parts.reflector, reflector, options.file, metadata, "reflector"),
         from_step=options.from_step,
         policy=policy,
         seed=options.seed,
@@ -101,31 +100,24 @@ def main(options: Options) -> int:
     return 0
 
 
-def _checkpoint(kind: type, name: str | None, file: Path, metadata: dict, part: str):
+def _checkpoint(part: Part, name: str | None, file: Path, metadata: dict, kind: str):
     """A checkpoint by name or folder; without one, that of the run with the recorded hash, else the newest."""
     folder = file.resolve().parent.parent / "checkpoints"
     if name is not None and name != "recorded":
         named = folder / name
-        return kind.from_pretrained(named if named.is_dir() else Path(name)).eval()
-    found = [path.parent for path in folder.glob(f"*/{CONFIG_NAME}") if _class_of(path) == kind.__name__]
+        return part.load(named if named.is_dir() else Path(name)).eval()
+    found = [path for pattern in _NAMES[kind] for path in folder.glob(pattern) if path.is_dir()]
     if not found:
-        raise FileNotFoundError(f"no {kind.__name__} in {folder}: name a checkpoint with --{part.replace('_', '-')}")
+        option = kind.replace("_", "-")
+        raise FileNotFoundError(f"no {kind.replace('_', ' ')} in {folder}: name a checkpoint with --{option}")
     found.sort(key=lambda path: path.stat().st_mtime)
-    recorded = metadata.get("models", {}).get(part)
-    models = {path: kind.from_pretrained(path).eval() for path in found}
+    recorded = metadata.get("models", {}).get(kind)
+    models = {path: part.load(path).eval() for path in found}
     for model in models.values():
         if model_hash(model) == recorded:
             return model
     return models[found[-1]]  # the replay says that it is another one
 
 
-def _class_of(path: Path) -> str:
-    try:
-        return json.loads(path.read_text()).get("class", "")
-    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError):
-        return ""
-
-
 if __name__ == "__main__":
-    warnings.filterwarnings("ignore", message="Creating .*WeightUpdater")
     sys.exit(main(tyro.cli(Options, description=__doc__)))

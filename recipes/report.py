@@ -16,6 +16,7 @@ import tyro
 
 from command_line import in_options
 from gather_evidence import gather, short
+from parts import COMPACT, Parts
 from worldenv_trl.report import Evidence, RunRecord, write_report
 
 
@@ -46,7 +47,7 @@ def main(settings: Report) -> Path:
     return out
 
 
-def write(settings: Report) -> Path:
+def write(settings: Report, parts: Parts = COMPACT) -> Path:
     """Writes the report and says where it is, and what is missing in it.
 
     Raises:
@@ -66,7 +67,8 @@ def write(settings: Report) -> Path:
     evidence = None
     if settings.models:
         try:
-            evidence = gather(record, settings.episodes_per_task, settings.clips_per_kind, settings.num_threads)
+            counts = settings.episodes_per_task, settings.clips_per_kind
+            evidence = gather(record, *counts, settings.num_threads, parts)
         except (OSError, ValueError, RuntimeError) as error:  # the logged figures are shown all the same
             evidence = Evidence(missing=[short(error)])
         for what in evidence.missing:

@@ -12,44 +12,34 @@ import torch
 from torchrl.objectives import BCLoss
 from tqdm import trange
 
-from config import WorldEnvConfig
-from parts import seed_everything, task_instructions
-from run_folder import RunFolder
+from episodes import demonstrations
+from run import Run
+from stages import run_alone
 from worldenv_trl import keys
-from worldenv_trl.data import episodes_from_rollouts, policy_samples
-from worldenv_trl.policies import OFTConfig, OFTPolicy, laplace_actor, likelihood_actor, random_shift
-from worldenv_trl.record import read_rollouts
+from worldenv_trl.data import policy_samples
+from worldenv_trl.policies import laplace_actor, likelihood_actor, random_shift
 
 
-def run(config: WorldEnvConfig, folder: RunFolder) -> None:
+def fine_tune(run: Run) -> None:
     """Reads ``rollouts/demonstrations.mcap``, writes ``checkpoints/sft``."""
-    settings = config.sft
-    seed_everything(config, offset=10)
-    episodes = episodes_from_rollouts(read_rollouts(folder.require_rollouts("demonstrations", "demonstrate")))
-    samples = policy_samples(episodes, config.chunk_length)
-    policy = OFTPolicy(
-        OFTConfig.for_tasks(
-            task_instructions(config),
-            image_size=config.image_size,
-            chunk_length=config.chunk_length,
-            dim=settings.dim,
-            depth=settings.depth,
-        )
-    )
+    config, settings = run.config, run.config.sft
+    run.seed_everything(offset=10)
+    samples = policy_samples(demonstrations(run), config.chunk_length)
+    policy = run.parts.policy.make(config)
     policy.fit_statistics(samples[keys.STATE], samples[keys.CHUNK])
-    heads_and_backbone = [*policy.backbone_parameters(), *policy.loc_head_parameters()]
+    scale = list(policy.scale_parameters())
+    others = [parameter for parameter in policy.parameters() if all(parameter is not each for each in scale)]
     loss = _behaviour_cloning(laplace_actor(policy), loss_function="l1")
-    _train(loss, samples, heads_and_backbone, settings.steps, settings.lr, settings, folder, "l1")
+    _train(loss, samples, others, settings.steps, settings.lr, run, "l1")
 
-    # Only the scale head moves from here on (World-Env section 4.1).
+    # Only the scale moves from here on (World-Env section 4.1).
     policy.requires_grad_(False)
-    scale_head = list(policy.scale_head_parameters())
-    for parameter in scale_head:
+    for parameter in scale:
         parameter.requires_grad_(True)
     loss = _behaviour_cloning(likelihood_actor(policy))
-    _train(loss, samples, scale_head, settings.scale_steps, settings.scale_lr, settings, folder, "nll")
+    _train(loss, samples, scale, settings.scale_steps, settings.scale_lr, run, "nll")
     policy.requires_grad_(True)
-    policy.save_pretrained(folder.checkpoint("sft"))
+    policy.save_pretrained(run.folder.checkpoint("sft"))
 
 
 def _behaviour_cloning(actor, **options) -> BCLoss:
@@ -60,7 +50,8 @@ def _behaviour_cloning(actor, **options) -> BCLoss:
     return loss
 
 
-def _train(loss, samples, parameters, steps, lr, settings, folder: RunFolder, name: str) -> None:
+def _train(loss, samples, parameters, steps: int, lr: float, run: Run, name: str) -> None:
+    settings, images = run.config.sft, [keys.image_key(camera) for camera in run.config.cameras]
     optimizer = torch.optim.AdamW(parameters, lr=lr, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
@@ -68,7 +59,8 @@ def _train(loss, samples, parameters, steps, lr, settings, folder: RunFolder, na
     progress = trange(steps, desc=f"sft {name}", unit="step")
     for step in progress:
         batch = samples[torch.randint(len(samples), (settings.batch_size,))]
-        batch[keys.IMAGE] = random_shift(batch[keys.IMAGE], settings.shift_px)
+        for image in images:
+            batch[image] = random_shift(batch[image], settings.shift_px)
         value = loss(batch)["loss_bc"]
         optimizer.zero_grad()
         value.backward()
@@ -76,11 +68,9 @@ def _train(loss, samples, parameters, steps, lr, settings, folder: RunFolder, na
         optimizer.step()
         schedule.step()
         if step % 50 == 0 or step == steps - 1:
-            folder.log("sft", step=step, **{name: value.item()})
+            run.folder.log("sft", step=step, **{name: value.item()})
             progress.set_postfix(loss=f"{value.item():.4f}")
 
 
 if __name__ == "__main__":
-    from world_env import run_single
-
-    run_single("sft")
+    run_alone("sft", fine_tune)

@@ -6,92 +6,85 @@ Alone: ``python recipes/train_world_model.py improve --run-dir runs/improve``.
 from __future__ import annotations
 
 import math
+import tempfile
 import time
 
 import torch
-from tensordict import TensorDict
 from tqdm import trange
 
-from config import WorldEnvConfig
-from parts import load_world_model, read_episodes, seed_everything, split_by_context
-from run_folder import RunFolder
-from worldenv_trl.data import WindowSampler, concatenate_episodes
-from worldenv_trl.data.imagine import imagine_episodes
-from worldenv_trl.kinematics import ForwardKinematics
+from episodes import demonstrations_and_exploration, split_by_context
+from run import Run
+from stages import run_alone
+from worldenv_trl.data import Episodes, imagine_episodes, window_buffer
 from worldenv_trl.metrics import moving_pixel_psnr, psnr
-from worldenv_trl.objectives import DiffusionLoss
-from worldenv_trl.scenes import load_task
-from worldenv_trl.world_models import VideoWorldModel, VideoWorldModelConfig
+from worldenv_trl.objectives import WorldModelLoss
+from worldenv_trl.world_models import WorldModel
 
 HORIZONS = (1, 20, 40, 56, 60)
 
 
-def run(
-    config: WorldEnvConfig, folder: RunFolder, target: str = "world_model", previous: str | None = None, rounds: int = 1
-) -> None:
+def train_world_model(run: Run, target: str = "world_model", previous: str | None = None, rounds: int = 1) -> None:
     """Reads the rollouts of the first ``rounds`` rounds; writes ``checkpoints/<target>`` and its held-out fidelity."""
-    settings = config.world_model
-    seed_everything(config, offset=30 + rounds)
-    demonstrations, explored = read_episodes(folder, rounds)
+    config, settings = run.config, run.config.world_model
+    run.seed_everything(offset=30 + rounds)
+    demonstrated, explored = demonstrations_and_exploration(run, rounds)
     training, held_out = split_by_context(explored, settings.holdout, config.seed)
-    training = concatenate_episodes([demonstrations, training])
-    model = new_model(config) if previous is None else load_world_model(folder, previous.removeprefix("world_model"))
-    model.train()
-    sampler = WindowSampler(
-        training, ForwardKinematics(), model, failure_share=settings.failure_share, seed=config.seed + rounds
-    )
-    loss = DiffusionLoss(model, unroll_prob=settings.unroll_prob, frames_per_chunk=settings.frames_per_chunk)
-    steps = settings.steps if previous is None else settings.refit_steps
-    optimizer = torch.optim.AdamW(model.parameters(), lr=settings.lr, weight_decay=settings.weight_decay)
+    training = Episodes.cat([demonstrated, training])
+    if previous is None:
+        model, steps = run.parts.world_model.make(config), settings.steps
+    else:
+        model, steps = run.world_model(previous.removeprefix("world_model")), settings.refit_steps
+    parameters = [parameter for parameter in model.train().parameters() if parameter.requires_grad]
+    if parameters:
+        options = {"failure_share": settings.failure_share, "seed": config.seed + rounds}
+        windows = window_buffer(training, run.kinematics, model, batch_size=settings.batch_size, **options)
+        _train(run, model, parameters, windows, steps, target)
+    model.eval().save_pretrained(run.folder.checkpoint(target))
+    figures = fidelity(run, model, held_out)
+    run.folder.log(target, episodes=len(training), held_out=len(held_out), **figures)
+
+
+def _train(run: Run, model: WorldModel, parameters: list[torch.nn.Parameter], windows, steps: int, target: str) -> None:
+    settings, loss = run.config.world_model, WorldModelLoss(model)
+    optimizer = torch.optim.AdamW(parameters, lr=settings.lr, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 100) * (0.02 + 0.49 * (1 + math.cos(math.pi * step / steps)))
     )
     progress, started, running = trange(steps, desc=target, unit="step"), time.monotonic(), None
     for step in progress:
-        value = loss(sampler.sample(settings.batch_size))["loss_diffusion"]
+        value = loss(windows.sample())["loss_world_model"]
         optimizer.zero_grad()
         value.backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        torch.nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
         schedule.step()
         running = value.item() if running is None else 0.98 * running + 0.02 * value.item()
         if step % 50 == 0 or step == steps - 1:
-            folder.log(target, step=step, loss=running, steps_per_second=(step + 1) / (time.monotonic() - started))
+            speed = (step + 1) / (time.monotonic() - started)
+            run.folder.log(target, step=step, loss=running, steps_per_second=speed)
             progress.set_postfix(loss=f"{running:.4f}")
-    model.eval().save_pretrained(folder.checkpoint(target))
-    folder.log(target, episodes=len(training), held_out=len(held_out), **fidelity(model, held_out))
 
 
-def new_model(config: WorldEnvConfig) -> VideoWorldModel:
-    """An untrained model for the cameras of the tasks."""
-    cameras = {task.task_id: task.camera("agentview") for task in map(load_task, config.tasks)}
-    return VideoWorldModel(
-        VideoWorldModelConfig.for_cameras(
-            cameras,
-            image_size=config.image_size,
-            chunk_length=config.chunk_length,
-            num_denoise_steps=config.world_model.denoise_steps,
-            deterministic=config.world_model.deterministic,
-        )
-    )
+def fidelity(run: Run, model: WorldModel, episodes: Episodes) -> dict[str, float]:
+    """PSNR of open-loop imagination at some horizons, on all and on moving pixels, beside copying the first frame.
 
-
-def fidelity(model: VideoWorldModel, episodes: TensorDict) -> dict[str, float]:
-    """PSNR of open-loop imagination at some horizons, on all and on moving pixels, beside copying the first frame."""
-    imagined = imagine_episodes(model, episodes, ForwardKinematics())["frames"]  # [R, T+1, 3, H, W]
+    Figures of further cameras end in their names.
+    """
     figures: dict[str, float] = {}
-    for horizon in (horizon for horizon in HORIZONS if horizon < imagined.shape[1]):
-        alive = (episodes["length"].squeeze(-1) >= horizon).nonzero().squeeze(-1)
-        if not len(alive):
-            continue
-        real, first = episodes["frames"][alive, horizon], episodes["frames"][alive, 0]
-        for name, guess in (("model", imagined[alive, horizon]), ("copy", first)):
-            figures[f"psnr_{name}_{horizon}"] = psnr(guess, real).clamp(max=60).mean().item()
-            figures[f"moving_psnr_{name}_{horizon}"] = moving_pixel_psnr(guess, real, first).nanmean().item()
+    with tempfile.TemporaryDirectory(dir=run.folder.path) as scratch:
+        imagined = imagine_episodes(model, episodes, run.kinematics, folder=scratch)
+        for horizon in (horizon for horizon in HORIZONS if horizon <= episodes["actions"].shape[1]):
+            alive = (episodes["length"].squeeze(-1) >= horizon).nonzero().squeeze(-1)
+            for place, camera in enumerate(model.cameras if len(alive) else ()):
+                suffix = f"_{camera}" if place else ""
+                at = torch.full_like(alive, horizon)
+                real, first = episodes.frames(camera, alive, at), episodes.frames(camera, alive, torch.zeros_like(at))
+                for name, guess in (("model", imagined.frames(camera, alive, at)), ("copy", first)):
+                    figures[f"psnr_{name}_{horizon}{suffix}"] = psnr(guess, real).clamp(max=60).mean().item()
+                    moving = moving_pixel_psnr(guess, real, first).nanmean().item()
+                    figures[f"moving_psnr_{name}_{horizon}{suffix}"] = moving
     return figures
 
 
 if __name__ == "__main__":
-    from world_env import run_single
-
-    run_single("train_world_model")
+    run_alone("train_world_model", train_world_model)

@@ -5,34 +5,31 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType
 
-from config import WorldEnvConfig
-from parts import chunk_player, step_env, tabletop
-from train_reflector import all_scores, stops
+from physics import chunk_player, step_env, tabletop
+from run import Run
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
-from worldenv_trl.data import concatenate_episodes, episodes_from_rollouts, imagine_episodes
+from worldenv_trl.data import Episodes, episodes_from_rollouts, imagine_episodes, score_episodes
 from worldenv_trl.envs import context_id
-from worldenv_trl.kinematics import ForwardKinematics
-from worldenv_trl.metrics import honesty
-from worldenv_trl.reflectors import CompactReflector
+from worldenv_trl.metrics import first_success, honesty, judged
+from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.scenes import load_task
-from worldenv_trl.world_models import VideoWorldModel
+from worldenv_trl.world_models import WorldModel
 
 
 @dataclass(frozen=True)
 class TwoWorlds:
-    """Episodes ``[R]`` of the physics, the frames that imagination makes of their actions, and what is judged of both.
+    """Episodes ``[R]`` of the physics, what imagination makes of their actions, and what is judged of both.
 
     ``real_scores`` and ``imagined_scores`` are R(o_1:t, g) ``[R, T + 1]``; ``real_stop`` and ``imagined_stop`` int64
     ``[R]`` the frame at which the reflector's rule ends the episode, -1 if never.
     """
 
-    episodes: TensorDict
-    imagined_frames: Tensor  # uint8 [R, T + 1, 3, H, W]
+    episodes: Episodes
+    imagined: Episodes
     real_scores: Tensor
     imagined_scores: Tensor
     real_stop: Tensor
@@ -48,35 +45,14 @@ class TwoWorlds:
         return judged(self.imagined_stop, self.reached, late)
 
 
-def first_success(success: Tensor) -> Tensor:
-    """First True of bool ``[R, T + 1]``, -1 where there is none."""
-    return torch.where(success.any(1), success.long().argmax(1), -1)
-
-
-def judged(stop: Tensor, reached: Tensor, late: int = 2) -> tuple[Tensor, Tensor]:
-    """What imagination says of each row, and whether it is so.
-
-    Args:
-        stop: int64 ``[R]``, where imagination stops a row as done; -1 if never.
-        reached: int64 ``[R]``, where the physics first reaches the goal under the same actions; -1 if never.
-        late: frames by which the physics may come after the stop: imagined time is not exact.
-
-    Returns:
-        ``imagined``, ``real`` bool ``[R]``. The stop ends the episode: a goal that is reached later does not count.
-    """
-    imagined = stop >= 0
-    real = (reached >= 0) & (~imagined | (reached <= stop + late))
-    return imagined, real
-
-
-def live(config: WorldEnvConfig, actor, per_task: int, split: str = "test") -> TensorDict:
+def live(run: Run, actor, per_task: int, split: str = "test") -> Episodes:
     """Greedy episodes of every task in the physics, each to the step limit whether the goal is reached or not.
 
     Returns:
         Episodes ``[R]`` (:func:`~worldenv_trl.data.episodes_from_rollouts`) from the first ``per_task`` initial states
         of the split.
     """
-    parts = []
+    config, parts = run.config, []
     for task in config.tasks:
         options = {"init_state_mode": "cycle", "init_state_count": per_task, "terminate_on_success": False}
         collector = GroupCollector(
@@ -89,38 +65,34 @@ def live(config: WorldEnvConfig, actor, per_task: int, split: str = "test") -> T
         )
         parts.append(episodes_from_rollouts(next(iter(collector))[:, 0]))
         collector.shutdown()
-    return concatenate_episodes(parts)
+    return Episodes.cat(parts)
 
 
-def imagine(world_model: VideoWorldModel, reflector: CompactReflector, episodes: TensorDict) -> TwoWorlds:
-    """The actions of physical ``episodes`` [R] in imagination, and the reflector's view of both videos."""
-    imagined = imagine_episodes(world_model, episodes, ForwardKinematics())
-    scores = {"real": all_scores(reflector, episodes), "imagined": all_scores(reflector, imagined)}
-    rule = reflector.config
-    return TwoWorlds(
-        episodes,
-        imagined["frames"],
-        scores["real"],
-        scores["imagined"],
-        stops(scores["real"], episodes, (rule.real_threshold, rule.real_consecutive)),
-        stops(scores["imagined"], episodes, (rule.threshold, rule.consecutive)),
-    )
+def imagine(
+    run: Run, world_model: WorldModel, reflector: Reflector, rules: dict[str, StopRule], episodes: Episodes
+) -> TwoWorlds:
+    """The actions of physical ``episodes`` in imagination, and the reflector's view of both."""
+    imagined = imagine_episodes(world_model, episodes, run.kinematics)
+    scores = {"real": score_episodes(reflector, episodes), "imagined": score_episodes(reflector, imagined)}
+    stops = {name: rules[name].first(values, episodes.alive) for name, values in scores.items()}
+    return TwoWorlds(episodes, imagined, scores["real"], scores["imagined"], stops["real"], stops["imagined"])
 
 
-def relive(config: WorldEnvConfig, imagined: TensorDictBase, split: str = "train") -> Tensor:
+def relive(run: Run, imagined: Episodes, split: str = "train") -> Tensor:
     """Success bool ``[R, T + 1]`` in the physics of the actions of ``imagined`` episodes ``[R]``, frame by frame.
 
     Each row starts from the initial state that its ``context_id`` names; nothing is rendered. Past an episode's end the
     last value is repeated.
     """
+    config = run.config
     context, length = imagined[keys.CONTEXT_ID].squeeze(-1), imagined["length"]
     success = torch.zeros(*imagined["actions"].shape[:2], dtype=torch.bool)
-    for name in config.tasks:
+    for number, name in enumerate(config.tasks):
         task = load_task(name)
-        rows = (imagined[keys.TASK_ID].squeeze(-1) == task.task_id).nonzero().squeeze(-1)
+        rows = (imagined[keys.TASK_ID].squeeze(-1) == number).nonzero().squeeze(-1)
         if not len(rows):
             continue
-        index = context[rows] - context_id(task.task_id, split, 0)
+        index = context[rows] - context_id(number, split, 0)
         env = tabletop(
             config,
             split,
@@ -146,12 +118,14 @@ def honesty_of(worlds: TwoWorlds, rows: Tensor | None = None) -> dict:
     """:func:`~worldenv_trl.metrics.honesty` of some rows (all by default): outcomes, stop times and drift."""
     rows = torch.arange(len(worlds.episodes)) if rows is None else rows
     imagined, real = (side[rows] for side in worlds.outcomes())
+    frame = torch.arange(worlds.real_scores.shape[1])
+    camera = worlds.imagined.cameras[0]
     return honesty(
         imagined,
         real,
         imagined_steps=worlds.imagined_stop[rows],
         real_steps=worlds.reached[rows],
-        imagined_frames=worlds.imagined_frames[rows],
-        real_frames=worlds.episodes["frames"][rows],
+        imagined_frames=worlds.imagined.frames(camera, rows.unsqueeze(-1), frame),
+        real_frames=worlds.episodes.frames(camera, rows.unsqueeze(-1), frame),
         length=worlds.episodes["length"][rows],
     )

@@ -20,8 +20,7 @@ import tyro
 
 from command_line import one_line_errors
 from worldenv_trl.record import list_rollouts
-from worldenv_trl.record.viewers_foxglove import foxglove_layout
-from worldenv_trl.record.viewers_rerun import require_rerun, rerun_recording
+from worldenv_trl.record.view import foxglove_layout, require_rerun, rerun_recording
 
 MOST = 16  # rollouts that are shown if none is named
 

@@ -67,3 +67,8 @@ def image_key(camera: str) -> tuple[str, str]:
 def frames_key(camera: str) -> tuple[str, str]:
     """Where the images of a scene's ``camera`` over a chunk are: uint8 [*B, C, 3, H, W]."""
     return (FRAMES, image_entry(camera))
+
+
+def camera_of(entry: str) -> str:
+    """The scene's camera whose images are called ``entry``: the inverse of :func:`image_entry`."""
+    return next((camera for camera, name in _IMAGE_ENTRIES.items() if name == entry), entry)

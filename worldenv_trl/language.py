@@ -22,6 +22,14 @@ def instructions_of(tensordict: TensorDictBase) -> list[str]:
 
     Raises:
         ValueError: if there is none.
+
+    Examples:
+        >>> from tensordict import NonTensorStack, TensorDict
+        >>> texts = NonTensorStack("open the drawer", "turn on the stove")
+        >>> instructions_of(TensorDict({"language_instruction": texts}, [2]))
+        ['open the drawer', 'turn on the stove']
+        >>> instructions_of(TensorDict({"language_instruction": "open the drawer"}, [2]))
+        ['open the drawer', 'open the drawer']
     """
     text = tensordict.get(INSTRUCTION, None)
     if text is None:
@@ -29,6 +37,8 @@ def instructions_of(tensordict: TensorDictBase) -> list[str]:
     if isinstance(text, str):
         return [text] * tensordict.numel()
     nested = text.tolist()
+    if isinstance(nested, str):  # no batch dimension
+        return [nested]
     while nested and isinstance(nested[0], list):
         nested = [item for part in nested for item in part]
     return [str(words) for words in nested]
@@ -45,6 +55,14 @@ class Vocabulary:
     Args:
         words: all words, :data:`PAD_WORD` and :data:`UNKNOWN_WORD` first; see :meth:`of`.
         max_words: longest instruction.
+
+    Examples:
+        >>> vocabulary = Vocabulary(Vocabulary.of(["open the drawer", "turn on the stove"]))
+        >>> vocabulary.words
+        ('<pad>', '<unk>', 'drawer', 'on', 'open', 'stove', 'the', 'turn')
+        >>> vocabulary.ids(["Open the drawer!", "push the big drawer"])
+        tensor([[4, 6, 2, 0],
+                [1, 6, 1, 2]])
     """
 
     def __init__(self, words: Sequence[str], max_words: int = 16) -> None:
@@ -57,15 +75,26 @@ class Vocabulary:
         """The words of ``instructions``, sorted, after the two special ones."""
         return (PAD_WORD, UNKNOWN_WORD, *sorted({word for text in instructions for word in split_words(text)}))
 
-    def ids(self, instructions: Sequence[str], device: torch.device | str | None = None) -> Tensor:
-        """int64 ``[n, L]``, padded with 0 at the end.
+    def ids(
+        self, instructions: Sequence[str], device: torch.device | str | None = None, *, min_length: int = 1
+    ) -> Tensor:
+        """int64 [n, L], padded with 0 at the end.
+
+        Args:
+            instructions: n texts.
+            device: of the result.
+
+        Keyword Args:
+            min_length: L is the length of the longest instruction, and no less than this: with the longest one of the
+                training, a row does not depend on which others are in its batch.
 
         Raises:
             ValueError: for an instruction without words, or of more than ``max_words``.
         """
         rows = [self._of_text(text) for text in instructions]
-        length = max(len(row) for row in rows)
-        return torch.tensor([row + [0] * (length - len(row)) for row in rows], device=device)
+        length = max([min_length, *map(len, rows)])
+        ids = [row + [0] * (length - len(row)) for row in rows]
+        return torch.tensor(ids, dtype=torch.int64, device=device).reshape(len(rows), length)
 
     def _of_text(self, text: str) -> list[int]:
         if text not in self._cache:
@@ -82,6 +111,13 @@ class SeenInstructions:
     Args:
         part: what warns, in words: "the policy".
         instructions: of the training; empty for a part that was not trained, which never warns.
+
+    Examples:
+        >>> seen = SeenInstructions("the policy", ["open the drawer"])
+        >>> with warnings.catch_warnings(action="always", record=True) as caught:
+        ...     seen.check(["open the drawer", "close the drawer", "close the drawer"])
+        >>> [str(warning.message)[:61] for warning in caught]
+        ["the policy was never trained on the instruction 'close the dr"]
     """
 
     def __init__(self, part: str, instructions: Sequence[str]) -> None:

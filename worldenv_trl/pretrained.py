@@ -7,7 +7,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 import safetensors
@@ -18,7 +18,13 @@ CONFIG_NAME = "config.json"
 WEIGHTS_NAME = "model.safetensors"
 
 
-class Pretrained:
+if TYPE_CHECKING:
+    from torch.nn import Module as _Module  # it stands beside one
+else:
+    _Module = object
+
+
+class Pretrained(_Module):
     """Gives an ``nn.Module`` ``save_pretrained(folder)`` and ``from_pretrained(folder)``.
 
     The module is built from one dataclass: ``__init__(self, config)`` accepts an instance of :attr:`config_class`

@@ -14,13 +14,14 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import demonstrate
-import sft
+from checks import check_config
 from command_line import at_least, refusals
 from config import SFT, WorldEnvConfig
+from demonstrate import demonstrate
 from outcomes import physics_outcomes
-from parts import check_config, load_policy, seed_everything
+from run import Run
 from run_folder import RunFolder
+from sft import fine_tune
 from worldenv_trl.metrics import wilson_interval
 from worldenv_trl.policies import laplace_actor
 from worldenv_trl.scenes import list_tasks, load_task
@@ -56,14 +57,15 @@ def main(settings: Settings) -> None:
         check_config(config)
         folder = RunFolder(config.run_dir)
         folder.open(config)
-    demonstrate.run(config, folder)
-    sft.run(config, folder)
-    seed_everything(config, offset=90)
-    actor = laplace_actor(load_policy(folder, "sft", "sft"))
+    run = Run(config, folder)
+    demonstrate(run)
+    fine_tune(run)
+    run.seed_everything(offset=90)
+    actor = laplace_actor(run.policy("sft", "sft"))
     print("| task | solved |\n|---|---|")
     everything = []
     for task in tasks:
-        everything.append(physics_outcomes(config, actor, task, "test", settings.episodes_per_task))
+        everything.append(physics_outcomes(run, actor, task, "test", settings.episodes_per_task))
         print(f"| {task} | {int(everything[-1].sum())} / {len(everything[-1])} |", flush=True)
     success = torch.cat(everything)
     low, high = wilson_interval(int(success.sum()), len(success))

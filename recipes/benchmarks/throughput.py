@@ -22,18 +22,20 @@ from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
 from config import WorldEnvConfig
-from parts import imagined_env, physics_waves_env, tabletop, task_instructions
-from train_world_model import new_model
+from imagination import Imagination
+from parts import COMPACT
+from physics import physics_waves_env, tabletop
+from run import Run
+from run_folder import RunFolder
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
-from worldenv_trl.data import WindowSampler, episodes_from_rollouts, policy_samples
+from worldenv_trl.data import episodes_from_rollouts, policy_samples, window_buffer
 from worldenv_trl.envs import ExpertPolicy
-from worldenv_trl.kinematics import ForwardKinematics
-from worldenv_trl.objectives import DiffusionLoss, LOOPLoss
-from worldenv_trl.policies import OFTConfig, OFTPolicy, laplace_actor
+from worldenv_trl.objectives import LOOPLoss, WorldModelLoss
+from worldenv_trl.policies import laplace_actor
 from worldenv_trl.record import RolloutWriter, read_rollouts
-from worldenv_trl.reflectors import CompactReflector, CompactReflectorConfig
-from worldenv_trl.world_models import VideoWorldModel
+from worldenv_trl.reflectors import StopRule
+from worldenv_trl.world_models import WorldModel
 
 
 @dataclass(frozen=True)
@@ -46,21 +48,21 @@ class Benchmark:
     """Batch sizes of TabletopEnv."""
 
 
-class _Timed(torch.nn.Module):
-    """A module that adds up the seconds spent inside it."""
+class _Timed(WorldModel):
+    """A world model that adds up the seconds spent inside it."""
 
-    def __init__(self, module: VideoWorldModel) -> None:
-        super().__init__()
-        self.module, self.seconds = module, 0.0
+    def __init__(self, model: WorldModel) -> None:
+        super().__init__(cameras=model.cameras, image_size=model.image_size, chunk_length=model.chunk_length)
+        self.model, self.seconds = model, 0.0
+
+    def memory_indices(self, now: torch.Tensor) -> torch.Tensor:
+        return self.model.memory_indices(now)
 
     def forward(self, tensordict: TensorDict) -> TensorDict:
         started = time.perf_counter()
-        out = self.module(tensordict)
+        out = self.model(tensordict)
         self.seconds += time.perf_counter() - started
         return out
-
-    def memory_indices(self, t: torch.Tensor) -> torch.Tensor:
-        return self.module.memory_indices(t)
 
 
 def report(name: str, unit: str, values: list[float]) -> None:
@@ -97,14 +99,11 @@ def main(settings: Benchmark) -> None:
     demonstrations = next(iter(GroupCollector(env, ExpertPolicy(env), groups_per_batch=15)))[:, 0]
     env.close()
     episodes = episodes_from_rollouts(demonstrations)
-    policy = OFTPolicy(OFTConfig.for_tasks(task_instructions(config)))
+    run = Run(config, RunFolder(config.run_dir))
+    policy, model, reflector = (part.make(config) for part in (COMPACT.policy, COMPACT.world_model, COMPACT.reflector))
     actor = laplace_actor(policy)
-    model, kinematics = new_model(config), ForwardKinematics()
-    reflector = CompactReflector(CompactReflectorConfig(num_tasks=3, threshold=0.99))
-    contexts = demonstrations[:, 0]
-
     timed = _Timed(model.eval())
-    env = imagined_env(config, timed, reflector, contexts, [8, 8])
+    env = Imagination(timed, reflector, StopRule(0.99), demonstrations[:, 0]).env(run, [8, 8])
     collector = GroupCollector(env, actor, groups_per_batch=8)
     total, shares = [], []
     for index in range(settings.repeats + 1):
@@ -127,12 +126,12 @@ def main(settings: Benchmark) -> None:
     cloning.set_keys(action=keys.CHUNK, pad_mask=keys.ACTION_IS_PAD)
     draw = lambda n: samples[torch.randint(len(samples), (n,))]  # noqa: E731
     report("SFT, batch 64", "steps/s", rate(lambda: train(lambda: cloning(draw(64))["loss_bc"], 5), settings.repeats))
-    sampler = WindowSampler(episodes, kinematics, model.train())
-    loss = DiffusionLoss(model, frames_per_chunk=config.world_model.frames_per_chunk)
     batch = config.world_model.batch_size
-    speeds = rate(lambda: train(lambda: loss(sampler.sample(batch))["loss_diffusion"], 3), settings.repeats)
+    windows = window_buffer(episodes, run.kinematics, model.train(), batch_size=batch)
+    loss = WorldModelLoss(model)
+    speeds = rate(lambda: train(lambda: loss(windows.sample())["loss_world_model"], 3), settings.repeats)
     report(f"world model, batch {batch}", "steps/s", speeds)
-    policy.add_lora(config.post_train.lora_rank)
+    policy.post_training_parameters(config.post_train.lora_rank)
     objective = LOOPLoss(actor, functional=False)
     decisions = wave[wave[keys.MASK]]
     decisions[keys.ADVANTAGE] = torch.randn(len(decisions), 1)

@@ -1,95 +1,119 @@
 from __future__ import annotations
 
+import warnings
+
 import pytest
 import torch
+from observations import INSTRUCTIONS, observed, oft_policy
 
+from worldenv_trl.keys import IMAGE, INSTRUCTION, LOC, LOG_SCALE, STATE, WRIST_IMAGE
 from worldenv_trl.policies import OFTConfig, OFTPolicy
 
-INSTRUCTIONS = {0: "put the bowl on the plate", 3: "open the top drawer", 7: "turn on the stove"}
-TASKS = torch.tensor([0, 3, 7, 3, 0])[:, None]
+
+def loc_of(policy: OFTPolicy, td) -> torch.Tensor:
+    return policy(td.copy())[LOC]
 
 
-def build(**kwargs) -> OFTPolicy:
-    torch.manual_seed(0)
-    settings = {"dim": 32, "depth": 2, "stem_widths": (8, 16), "head_dim": 48, **kwargs}
-    return OFTPolicy(OFTConfig.for_tasks(INSTRUCTIONS, **settings))
-
-
-@pytest.fixture
-def observation():
-    generator = torch.Generator().manual_seed(1)
-    image = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8, generator=generator)
-    return image, torch.randn(5, 7, generator=generator)
-
-
-def train_a_little(policy: OFTPolicy, image, state) -> None:
-    parameters = [p for p in policy.parameters() if p.requires_grad]
-    optimizer = torch.optim.Adam(parameters, 1e-2)
+def train_a_little(policy: OFTPolicy, td) -> None:
+    optimizer = torch.optim.Adam([p for p in policy.parameters() if p.requires_grad], 1e-2)
     for _ in range(3):
-        loc, log_scale = policy(image, state, TASKS)
+        out = policy(td.copy())
         optimizer.zero_grad()
-        ((loc - 1).abs().mean() + log_scale.square().mean()).backward()
+        ((out[LOC] - 1).abs().mean() + out[LOG_SCALE].square().mean()).backward()
         optimizer.step()
 
 
-def test_loc_and_log_scale_are_float32_chunks_and_the_scale_starts_at_exp_minus_3(observation):
-    loc, log_scale = build()(*observation, TASKS)
-    assert loc.shape == log_scale.shape == (5, 8, 7)
-    assert loc.dtype == log_scale.dtype == torch.float32
-    torch.testing.assert_close(log_scale, torch.full_like(log_scale, -3), atol=0.2, rtol=0)
+def test_loc_and_log_scale_are_float32_chunks_and_the_scale_starts_at_exp_minus_3():
+    out = oft_policy()(observed())
+    assert out[LOC].shape == out[LOG_SCALE].shape == (6, 8, 7)
+    assert out[LOC].dtype == out[LOG_SCALE].dtype == torch.float32
+    torch.testing.assert_close(out[LOG_SCALE], torch.full((6, 8, 7), -3.0), atol=0.2, rtol=0)
 
 
-def test_extra_batch_dimensions_are_kept(observation):
-    image, state = observation
-    policy = build()
-    flat = policy(image[:4], state[:4], TASKS[:4])
-    grouped = policy(image[:4].view(2, 2, 3, 64, 64), state[:4].view(2, 2, 7), TASKS[:4].view(2, 2, 1))
-    for a, b in zip(flat, grouped, strict=True):
-        torch.testing.assert_close(a, b.flatten(0, 1))
+def test_extra_batch_dimensions_are_kept():
+    policy = oft_policy()
+    grouped = policy(observed().reshape(2, 3))[LOC]
+    torch.testing.assert_close(grouped.flatten(0, 1), loc_of(policy, observed()))
 
 
-def test_one_row_alone_equals_the_same_row_of_a_batch(observation):
-    image, state = observation
-    policy = build()
-    together = policy(image, state, TASKS)[0]
-    alone = torch.cat([policy(image[i : i + 1], state[i : i + 1], TASKS[i : i + 1])[0] for i in range(5)])
-    torch.testing.assert_close(together, alone, atol=1e-5, rtol=1e-4)
+def test_one_row_alone_equals_the_same_row_of_a_batch():
+    policy = oft_policy()
+    alone = torch.cat([loc_of(policy, observed()[i : i + 1]) for i in range(6)])
+    torch.testing.assert_close(alone, loc_of(policy, observed()), atol=1e-5, rtol=1e-4)
 
 
-def test_the_text_of_a_task_gives_what_its_id_gives(observation):
-    policy = build()
-    texts = [INSTRUCTIONS[i] for i in TASKS.flatten().tolist()]
-    for a, b in zip(policy(*observation, TASKS), policy(*observation, instruction=texts), strict=True):
-        torch.testing.assert_close(a, b)
-    one = policy(*observation, instruction="Open the top DRAWER.")[0]
-    torch.testing.assert_close(one, policy(*observation, torch.full((5, 1), 3))[0])
+def test_one_text_for_all_rows_equals_the_text_of_each():
+    policy = oft_policy()
+    once, each = (observed(texts=texts) for texts in (INSTRUCTIONS[1], [INSTRUCTIONS[1]] * 6))
+    assert torch.equal(loc_of(policy, once), loc_of(policy, each))
 
 
-def test_another_instruction_changes_the_actions(observation):
-    policy = build()
-    train_a_little(policy, *observation)
-    a = policy(*observation, torch.zeros(5, 1, dtype=torch.int64))[0]
-    b = policy(*observation, torch.full((5, 1), 7))[0]
-    assert (a - b).abs().max() > 1e-3
+def test_case_and_punctuation_of_an_instruction_do_not_matter():
+    policy, texts = oft_policy(), ["Open the top_DRAWER."] * 6
+    with pytest.warns(UserWarning, match="never trained on"):
+        other = loc_of(policy, observed(texts=texts))
+    torch.testing.assert_close(other, loc_of(policy, observed(texts=INSTRUCTIONS[1])))
 
 
-def test_padding_words_do_not_matter(observation):
-    policy = build()
-    short = policy(*observation, instruction="turn on the stove")[0]
-    padded = policy(*observation, instruction=["turn on the stove"] * 4 + ["put the bowl on the plate"])[0]
-    torch.testing.assert_close(short[:4], padded[:4], atol=1e-5, rtol=1e-4)
+def test_another_instruction_changes_the_actions():
+    policy = oft_policy()
+    train_a_little(policy, observed())
+    one, other = (loc_of(policy, observed(texts=INSTRUCTIONS[i])) for i in (0, 2))
+    assert (one - other).abs().max() > 1e-3
 
 
-def test_image_and_proprioception_change_the_actions(observation):
-    image, state = observation
-    policy = build()
-    base = policy(image, state, TASKS)[0]
-    assert not torch.allclose(base, policy(image.flip(-1), state, TASKS)[0])
-    assert not torch.allclose(base, policy(image, state + 0.1, TASKS)[0])
+def test_an_instruction_longer_than_those_of_the_training_leaves_the_other_rows_as_they_are():
+    policy = oft_policy()
+    before = loc_of(policy, observed(texts=INSTRUCTIONS[1]))
+    texts = [*[INSTRUCTIONS[1]] * 5, "put the bowl on the plate and then turn on the stove"]
+    with pytest.warns(UserWarning, match="never trained on"):
+        after = loc_of(policy, observed(texts=texts))
+    torch.testing.assert_close(after[:5], before[:5], atol=1e-5, rtol=1e-4)
 
 
-def test_statistics_are_the_quantile_bounds_of_the_data(observation):
-    policy = build()
+def test_an_instruction_of_the_training_does_not_warn_and_another_one_warns_once():
+    policy = oft_policy()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        loc_of(policy, observed())
+        assert not caught
+        for _ in range(2):
+            assert loc_of(policy, observed(texts="close the window")).isfinite().all()
+    assert ["OFTPolicy was never trained on" in str(warning.message) for warning in caught] == [True]
+
+
+def test_image_and_proprioception_change_the_actions():
+    policy = oft_policy()
+    base = loc_of(policy, observed())
+    assert not torch.allclose(base, loc_of(policy, observed().set(IMAGE, observed()[IMAGE].flip(-1))))
+    assert not torch.allclose(base, loc_of(policy, observed().set(STATE, observed()[STATE] + 0.1)))
+
+
+def test_every_camera_changes_the_actions_and_which_is_which_matters():
+    policy = oft_policy(cameras=("agentview", "wrist"))
+    both = observed(("agentview", "wrist"))
+    base = loc_of(policy, both)
+    for key in (IMAGE, WRIST_IMAGE):
+        assert not torch.allclose(base, loc_of(policy, both.copy().set(key, both[key].flip(-1))))
+    swapped = both.copy().set(IMAGE, both[WRIST_IMAGE]).set(WRIST_IMAGE, both[IMAGE])
+    assert not torch.allclose(base, loc_of(policy, swapped))
+
+
+def test_cameras_are_read_in_the_order_of_the_config():
+    assert oft_policy(cameras=("wrist", "overhead")).in_keys == [
+        WRIST_IMAGE, ("observation", "overhead"), STATE, INSTRUCTION
+    ]  # fmt: skip
+
+
+def test_gradients_reach_the_stem_of_every_camera():
+    policy = oft_policy(cameras=("agentview", "wrist"))
+    policy(observed(("agentview", "wrist")))[LOC].square().sum().backward()
+    for keypoints in policy.backbone.keypoints:
+        assert keypoints.stem[0].weight.grad.abs().sum() > 0
+
+
+def test_statistics_are_the_quantile_bounds_of_the_data():
+    policy = oft_policy()
     states = torch.linspace(-3, 1, 1001)[:, None].repeat(1, 7)
     actions = torch.linspace(0, 0.5, 1001)[:, None].repeat(1, 7)
     actions[:, 6] = states[:, 5] = 0
@@ -98,95 +122,75 @@ def test_statistics_are_the_quantile_bounds_of_the_data(observation):
     torch.testing.assert_close(policy.state_center[moving], torch.full((6,), -1.0))
     torch.testing.assert_close(policy.state_half_range[moving], torch.full((6,), 4 * 0.49))
     assert policy.state_half_range[5] == pytest.approx(0.05)
-    torch.testing.assert_close(policy.action_half_range[:6], torch.full((6,), 0.5 * 0.49))
-    assert policy.action_half_range[6] == pytest.approx(0.005)
+    torch.testing.assert_close(policy.action_range[:6], torch.full((6,), 0.5 * 0.49))
+    assert policy.action_range[6] == pytest.approx(0.005)
 
 
-def test_a_state_in_other_units_changes_nothing_once_its_statistics_are_fitted(observation):
-    image, state = observation
-    policy, actions = build(), torch.rand(100, 7)
+def test_a_state_in_other_units_changes_nothing_once_its_statistics_are_fitted():
+    policy, actions, state = oft_policy(), torch.rand(100, 7), observed()[STATE]
     policy.fit_statistics(state, actions)
-    before = policy(image, state, TASKS)[0]
+    before = loc_of(policy, observed())
     policy.fit_statistics(3 * state + 2, actions)
-    torch.testing.assert_close(policy(image, 3 * state + 2, TASKS)[0], before, atol=1e-5, rtol=1e-4)
+    after = loc_of(policy, observed().set(STATE, 3 * state + 2))
+    torch.testing.assert_close(after, before, atol=1e-5, rtol=1e-4)
 
 
-def test_the_parameter_groups_cover_every_parameter_once():
-    policy = build()
-    groups = [
-        list(policy.backbone_parameters()),
-        list(policy.loc_head_parameters()),
-        list(policy.scale_head_parameters()),
-    ]
-    ids = [id(p) for group in groups for p in group]
-    assert sorted(ids) == sorted(id(p) for p in policy.parameters())
-    assert [id(p) for p in policy.head_parameters()] == [id(p) for group in groups[1:] for p in group]
+def test_adapters_change_nothing_until_they_are_trained():
+    policy = oft_policy()
+    before = loc_of(policy, observed())
+    policy.post_training_parameters(4)
+    torch.testing.assert_close(loc_of(policy, observed()), before)
 
 
-def test_adding_lora_changes_nothing_until_it_is_trained(observation):
-    policy = build()
-    before = policy(*observation, TASKS)[0]
-    policy.add_lora(4)
-    torch.testing.assert_close(policy(*observation, TASKS)[0], before)
-
-
-def test_with_lora_only_adapters_and_heads_learn(observation):
-    policy = build()
-    policy.add_lora(4)
+def test_after_adapters_were_added_only_they_and_the_heads_learn():
+    policy = oft_policy(cameras=("agentview", "wrist"))
+    groups = policy.post_training_parameters(4)
     before = {name: p.detach().clone() for name, p in policy.named_parameters()}
-    train_a_little(policy, *observation)
+    train_a_little(policy, observed(("agentview", "wrist")))
     changed = {name for name, p in policy.named_parameters() if not torch.equal(p, before[name])}
     assert all("lora_" in name or "_head." in name for name in changed)
-    assert {id(p) for p in policy.lora_parameters()} <= {
-        id(p) for name, p in policy.named_parameters() if name in changed
-    }
-    assert any("_head." in name for name in changed)
+    named = {id(p): name for name, p in policy.named_parameters()}
+    assert {named[id(p)] for p in groups["adapters"]} <= changed
+    assert {named[id(p)] for p in groups["heads"]} == {name for name in named.values() if "_head." in name}
+    assert any(".1." in name for name in changed if "keypoints" in name)  # adapters on the second camera's, too
 
 
-@pytest.mark.parametrize("lora", [False, True])
-def test_a_saved_policy_reloads_to_equal_outputs(observation, tmp_path, lora):
-    policy = build()
-    policy.fit_statistics(observation[1], torch.randn(50, 7))
-    if lora:
-        policy.add_lora(4, alpha=8)
-    train_a_little(policy, *observation)
+def test_what_is_asked_for_twice_is_the_same_and_another_rank_is_refused():
+    policy = oft_policy()
+    first = policy.post_training_parameters(2)
+    policy.requires_grad_(True)
+    second = policy.post_training_parameters(2)
+    for name in ("adapters", "heads"):
+        assert [id(p) for p in first[name]] == [id(p) for p in second[name]]
+    trained = {id(p) for group in first.values() for p in group}
+    assert {id(p) for p in policy.parameters() if p.requires_grad} == trained
+    with pytest.raises(ValueError, match="has adapters of rank 2"):
+        policy.post_training_parameters(4)
+    with pytest.raises(ValueError, match="rank must be at least 1"):
+        policy.post_training_parameters(0)
+
+
+@pytest.mark.parametrize("rank", [0, 4])
+def test_a_saved_policy_reloads_to_equal_outputs_and_knows_what_it_was_trained_for(tmp_path, rank):
+    cameras = ("agentview", "wrist")
+    policy, td = oft_policy(cameras=cameras, proprio="measured", chunk_length=4), observed(cameras)
+    policy.fit_statistics(td[STATE], torch.randn(50, 7))
+    if rank:
+        policy.post_training_parameters(rank)
+    train_a_little(policy, td)
     policy.save_pretrained(tmp_path)
     loaded = OFTPolicy.from_pretrained(tmp_path)
     assert loaded.config == policy.config
-    for a, b in zip(policy(*observation, TASKS), loaded(*observation, TASKS), strict=True):
-        assert torch.equal(a, b)
+    assert (loaded.cameras, loaded.proprio, loaded.chunk_length) == (cameras, "measured", 4)
+    assert loaded.instructions == INSTRUCTIONS
+    for key in (LOC, LOG_SCALE):
+        assert torch.equal(loaded(td.copy())[key], policy(td.copy())[key])
     trainable = {name for name, p in policy.named_parameters() if p.requires_grad}
     assert {name for name, p in loaded.named_parameters() if p.requires_grad} == trainable
 
 
-def test_a_second_lora_is_refused():
-    policy = build()
-    policy.add_lora(2)
-    with pytest.raises(ValueError, match="already has LoRA of rank 2"):
-        policy.add_lora(4)
-
-
-def test_other_image_sizes_work():
-    policy = build(image_size=96)
-    loc, _ = policy(torch.zeros(2, 3, 96, 96, dtype=torch.uint8), torch.zeros(2, 7), TASKS[:2])
-    assert loc.shape == (2, 8, 7)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"image": torch.zeros(5, 3, 64, 64)}, "uint8"),
-        ({"image": torch.zeros(5, 3, 32, 32, dtype=torch.uint8)}, "64, 64"),
-        ({"state": torch.zeros(5, 6)}, r"\[5, 7\]"),
-        ({"task_id": torch.full((5, 1), 4)}, r"task_id \[4\]"),
-        ({"task_id": torch.full((5, 1), 99)}, r"task_id \[99\]"),
-        ({"task_id": None}, "either task_id or instruction"),
-    ],
-)
-def test_bad_input_is_named(observation, change, message):
-    arguments = {"image": observation[0], "state": observation[1], "task_id": TASKS, **change}
-    with pytest.raises(ValueError, match=message):
-        build()(**arguments)
+def test_other_image_sizes_and_chunk_lengths_work():
+    assert oft_policy(image_size=96, chunk_length=5)(observed(size=96))[LOC].shape == (6, 5, 7)
 
 
 @pytest.mark.parametrize(
@@ -194,15 +198,15 @@ def test_bad_input_is_named(observation, change, message):
     [
         ({"image_size": 62}, "got 62"),
         ({"instructions": ()}, "got none"),
-        ({"task_ids": (0, 0, 1)}, "distinct"),
         ({"dim": 30}, "num_heads"),
+        ({"stem_widths": (8,)}, "two entries"),
     ],
 )
 def test_bad_configs_are_named(change, message):
     with pytest.raises(ValueError, match=message):
-        OFTConfig(**{"instructions": tuple(INSTRUCTIONS.values()), **change})
+        OFTConfig(**{"instructions": INSTRUCTIONS, **change})
 
 
 def test_statistics_need_finite_data():
     with pytest.raises(ValueError, match="finite"):
-        build().fit_statistics(torch.full((3, 7), float("nan")), torch.zeros(3, 7))
+        oft_policy().fit_statistics(torch.full((3, 7), float("nan")), torch.zeros(3, 7))

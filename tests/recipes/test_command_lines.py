@@ -17,8 +17,8 @@ from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import TabletopEnv
 from worldenv_trl.policies import OFTConfig, OFTPolicy
 from worldenv_trl.record import RolloutWriter, provenance
-from worldenv_trl.record.mcap_file import McapFile
-from worldenv_trl.record.scan import McapScan
+from worldenv_trl.record.mcap.file import McapFile
+from worldenv_trl.record.mcap.scan import McapScan
 
 
 @pytest.fixture(scope="module")

@@ -1,20 +1,38 @@
-"""Prefix sampling, batched prefix scores, and what the reward head learns."""
+"""Prefix sampling, scores of growing videos, and goals as text."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDict
 
-from worldenv_trl import keys
-from worldenv_trl.objectives import ReflectorLoss
-from worldenv_trl.reflectors import CompactReflector, CompactReflectorConfig, prefix_indices
+from worldenv_trl.reflectors import CompactReflector, CompactReflectorConfig
+from worldenv_trl.reflectors.compact import prefix_indices
+
+TEXTS = ("open the drawer", "put the left bowl on the right bowl", "put the right bowl on the left bowl")
+
+
+def make(**settings):
+    torch.manual_seed(0)
+    return CompactReflector(CompactReflectorConfig(TEXTS, image_size=16, num_frames=6, **settings)).eval()
 
 
 @pytest.fixture
 def reflector():
-    torch.manual_seed(0)
-    return CompactReflector(CompactReflectorConfig(num_tasks=2, image_size=16, num_frames=6)).eval()
+    return make()
+
+
+def film(rows, frames, cameras=("agentview",), seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    shape = (rows, frames, 3, 16, 16)
+    return {camera: torch.randint(256, shape, generator=generator, dtype=torch.uint8) for camera in cameras}
+
+
+def begun(reflector, video, texts):
+    return reflector.begin({camera: frames[:, 0] for camera, frames in video.items()}, texts)
+
+
+def piece(video, start, stop, rows=slice(None)):
+    return {camera: frames[rows, start:stop] for camera, frames in video.items()}
 
 
 @pytest.mark.parametrize("length", [1, 2, 5, 6, 7, 31])
@@ -32,85 +50,99 @@ def test_short_prefixes_beside_long_ones_show_all_their_frames_once():
     assert index[0].tolist() == [0, 1, 2, 2, 2, 2]
 
 
-def test_scores_of_a_chunks_prefixes_equal_those_of_each_prefix_alone(reflector):
-    features = torch.randn(3, 14, reflector.feature_dim)
-    first, task = torch.tensor([1, 4, 9]), torch.tensor([[0], [1], [0]])
-    scores = reflector.prefix_scores(features, first, 5, task)
+@pytest.mark.parametrize("cameras", [("agentview",), ("agentview", "wrist")])
+def test_scores_are_those_of_each_prefix_alone_in_whatever_pieces_the_frames_come(cameras):
+    reflector, video, texts = make(cameras=cameras), film(3, 14, cameras), list(TEXTS)
+    state = begun(reflector, video, texts)
+    streamed = [state["score"].unsqueeze(1)]
+    for start, stop in ((1, 4), (4, 5), (5, 13), (13, 14)):
+        state, scores = reflector.extend(state, piece(video, start, stop))
+        streamed.append(scores)
+        torch.testing.assert_close(state["score"], scores[:, -1])
+    streamed = torch.cat(streamed, 1)
     for row in range(3):
-        for k in range(5):
-            length = int(first[row]) + k + 1
-            index = prefix_indices(torch.tensor([length]), 6)[0]
-            alone = reflector.score(features[row, index][None], torch.tensor([len(index)]), task[row : row + 1])
-            torch.testing.assert_close(scores[row, k], alone[0])
+        features = reflector.encode(piece(video, 0, 14, row))
+        for last in range(14):
+            index = prefix_indices(torch.tensor([last + 1]), 6)[0]
+            query = reflector.query(reflector.vocabulary.ids([texts[row]]))
+            alone = reflector.logits(features[index][None], torch.tensor([len(index)]), query).sigmoid()
+            torch.testing.assert_close(streamed[row, last], alone[0])
+
+
+def test_videos_of_different_lengths_are_extended_together_as_they_would_be_alone(reflector):
+    video = film(3, 12)
+    alone = begun(reflector, video, list(TEXTS))
+    alone, expected = reflector.extend(alone, piece(video, 1, 12))
+    state = begun(reflector, video, list(TEXTS))
+    ahead, _ = reflector.extend(state[1:2], piece(video, 1, 6, slice(1, 2)))  # the second is five frames ahead
+    features = torch.zeros(3, 6, 96)
+    features[:, :1], features[1] = state["features"], ahead["features"][0]
+    state["features"], state["seen"] = features, torch.tensor([1, 6, 1])
+    kept = state.clone()
+    new = {
+        "agentview": torch.stack([video["agentview"][row, start : start + 4] for row, start in enumerate((1, 6, 1))])
+    }
+    grown, scores = reflector.extend(state, new)
+    assert (state == kept).all()  # what was given is not changed
+    assert grown["seen"].tolist() == [5, 10, 5]
+    for row, start in enumerate((1, 6, 1)):
+        torch.testing.assert_close(scores[row], expected[row, start - 1 : start + 3])
 
 
 def test_padding_frames_do_not_reach_the_score(reflector):
-    features = torch.randn(1, 6, reflector.feature_dim)
+    features, query = torch.randn(1, 6, 96), torch.randn(1, 96)
     spoilt = features.clone()
     spoilt[:, 3:] = 1e3
-    arguments = torch.tensor([3]), torch.tensor([[1]])
-    torch.testing.assert_close(reflector.score(features, *arguments), reflector.score(spoilt, *arguments))
+    lengths = torch.tensor([3])
+    torch.testing.assert_close(reflector.logits(features, lengths, query), reflector.logits(spoilt, lengths, query))
 
 
-def test_a_reloaded_reflector_gives_the_same_scores(reflector, tmp_path):
+@pytest.mark.parametrize("cameras", [("agentview",), ("wrist", "agentview")])
+def test_a_reloaded_reflector_gives_the_same_scores_and_knows_what_it_was_trained_for(tmp_path, cameras):
+    reflector = make(cameras=cameras)
     reflector.save_pretrained(tmp_path)
     again = CompactReflector.from_pretrained(tmp_path).eval()
-    frames = torch.randint(256, (4, 3, 16, 16), dtype=torch.uint8)
-    assert torch.equal(again.encode(frames), reflector.encode(frames))
-    features = torch.randn(2, 4, reflector.feature_dim)
-    arguments = features, torch.tensor([4, 2]), torch.tensor([[0], [1]])
-    assert torch.equal(again.score(*arguments), reflector.score(*arguments))
+    assert (again.cameras, again.image_size, again.instructions) == (cameras, 16, TEXTS)
+    video = film(3, 5, cameras)
+    _, scores = again.extend(begun(again, video, list(TEXTS)), piece(video, 1, 5))
+    assert torch.equal(scores, reflector.extend(begun(reflector, video, list(TEXTS)), piece(video, 1, 5))[1])
 
 
-def test_the_loss_is_the_binary_cross_entropy_of_the_scores_and_leaves_the_encoder_alone(reflector):
-    batch = TensorDict(
-        {
-            "features": torch.randn(5, 6, reflector.feature_dim),
-            "lengths": torch.tensor([[1], [2], [3], [5], [6]]),
-            keys.TASK_ID: torch.tensor([[0], [1], [0], [1], [0]]),
-            "label": torch.tensor([[True], [False], [True], [True], [False]]),
-        },
-        batch_size=[5],
-    )
-    value = ReflectorLoss(reflector)(batch)["loss_reflector"]
-    p = reflector.score(batch["features"], batch["lengths"].squeeze(-1), batch[keys.TASK_ID])
-    expected = -sum((q if y else 1 - q).log() for q, y in zip(p, batch["label"].squeeze(-1), strict=True)) / 5
-    torch.testing.assert_close(value, expected)
-    value.backward()
-    assert all(parameter.grad is None for parameter in reflector.encoder.parameters())
-    assert any(parameter.grad is not None for parameter in reflector.head_parameters())
+def test_every_camera_reaches_the_score():
+    reflector, cameras = make(cameras=("agentview", "wrist")), ("agentview", "wrist")
+    video = film(1, 1, cameras)
+    score = begun(reflector, video, TEXTS[:1])["score"]
+    for camera in cameras:
+        changed = video | {camera: 255 - video[camera]}
+        assert (begun(reflector, changed, TEXTS[:1])["score"] - score).abs() > 1e-5
 
 
-def test_the_reward_head_learns_when_a_bright_patch_appears(reflector):
-    torch.manual_seed(1)
-    frames = torch.randint(0, 40, (32, 8, 3, 16, 16), dtype=torch.uint8)
-    onset = torch.randint(1, 9, (32,))
-    label = torch.arange(8) >= onset[:, None]
-    frames[label] = frames[label].clone().index_fill(-1, torch.arange(4, 8), 250)
-    task = torch.zeros(32, 1, dtype=torch.int64)
-    features = reflector.encode(frames.flatten(0, 1)).unflatten(0, (32, 8))
-    optimizer = torch.optim.Adam(reflector.head_parameters(), lr=3e-3)
-    loss = ReflectorLoss(reflector)
-    for _ in range(60):
-        row, frame = torch.randint(24, (64,)), torch.randint(8, (64,))
-        sampled, used = reflector.sample_prefixes(features, row, frame + 1)
-        batch = {
-            "features": sampled,
-            "lengths": used[:, None],
-            keys.TASK_ID: task[row],
-            "label": label[row, frame][:, None],
-        }
-        optimizer.zero_grad()
-        loss(TensorDict(batch, batch_size=[64]))["loss_reflector"].backward()
-        optimizer.step()
-    scores = reflector.prefix_scores(features[24:], torch.zeros(8, dtype=torch.int64), 8, task[24:])
-    assert ((scores > 0.5) == label[24:]).float().mean() > 0.95
+def test_the_score_depends_on_the_instruction_and_not_on_the_rows_beside_it(reflector):
+    video = {"agentview": film(1, 1)["agentview"].expand(3, 1, 3, 16, 16)}
+    scores = begun(reflector, video, list(TEXTS))["score"]
+    assert (scores[0] - scores[1]).abs() > 1e-5
+    torch.testing.assert_close(begun(reflector, piece(video, 0, 1, slice(1)), TEXTS[:1])["score"], scores[:1])
 
 
-def test_frames_of_another_size_and_settings_out_of_range_are_refused(reflector):
-    with pytest.raises(ValueError, match=r"\[n, 3, 16, 16\], got \[1, 3, 8, 8\]"):
-        reflector.encode(torch.zeros(1, 3, 8, 8, dtype=torch.uint8))
-    with pytest.raises(ValueError, match="threshold"):
-        CompactReflectorConfig(num_tasks=1, threshold=1.5)
+def test_an_unseen_instruction_is_warned_of_and_goes_by_the_words_that_are_known(reflector):
+    video = film(1, 1)
+    with pytest.warns(UserWarning, match="never trained on the instruction 'open the vault'"):
+        unseen = begun(reflector, video, ["open the vault"])["score"]
+    with pytest.warns(UserWarning, match="'open the hatch'"):
+        other = begun(reflector, video, ["open the hatch"])["score"]
+    assert torch.equal(unseen, other)  # an unknown word is an unknown word
+
+
+def test_frames_of_another_size_or_camera_and_settings_out_of_range_are_refused(reflector):
+    with pytest.raises(ValueError, match=r"'agentview' must be \[n, 3, 16, 16\], got \[1, 3, 8, 8\]"):
+        reflector.begin({"agentview": torch.zeros(1, 3, 8, 8, dtype=torch.uint8)}, TEXTS[:1])
+    with pytest.raises(ValueError, match="looks at 'agentview', the frames are of wrist"):
+        reflector.begin({"wrist": torch.zeros(1, 3, 16, 16, dtype=torch.uint8)}, TEXTS[:1])
+    with pytest.raises(ValueError, match="at least one instruction"):
+        CompactReflectorConfig(())
     with pytest.raises(ValueError, match="num_frames must be at least 2"):
-        CompactReflectorConfig(num_tasks=1, num_frames=1)
+        CompactReflectorConfig(TEXTS, num_frames=1)
+    with pytest.raises(ValueError, match="multiple of 8 px and at least 16, got 20"):
+        CompactReflectorConfig(TEXTS, image_size=20)
+    with pytest.raises(ValueError, match="each once"):
+        CompactReflector(CompactReflectorConfig(TEXTS, cameras=("wrist", "wrist")))

@@ -1,4 +1,4 @@
-"""Episodes: the one layout in which recorded or imagined rollouts reach the training stages."""
+"""Episodes: what every training stage reads. Numbers in memory, frames wherever they are."""
 
 from __future__ import annotations
 
@@ -8,128 +8,220 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from worldenv_trl.keys import (
-    ACTION,
-    CHUNK,
-    CONTEXT_ID,
-    FRAMES,
-    IMAGE,
-    KINEMATIC_STATE,
-    KINEMATIC_STATES,
-    MASK,
-    STATE,
-    STATES,
-    STEP_MASK,
-    SUCCESS,
-    TASK_ID,
-)
+from worldenv_trl.keys import CONTEXT_ID, FRAMES, TASK_ID, camera_of, frames_key
 
-__all__ = ["concatenate_episodes", "episodes_from_rollouts"]
+__all__ = ["Episodes"]
 
-_ROOT = (IMAGE, STATE, KINEMATIC_STATE, TASK_ID, CONTEXT_ID)
-_OBSERVED = ((FRAMES, FRAMES, IMAGE), (STATES, STATES, STATE), (KINEMATIC_STATES, KINEMATIC_STATES, KINEMATIC_STATE))
+ONCE = ("length", TASK_ID, CONTEXT_ID)  # entries of an episode, not of its steps
 
 
-def episodes_from_rollouts(rollouts: TensorDictBase) -> TensorDict:
-    """Episodes from TorchRL rollouts ``[*B, T]``, one action or one chunk a step.
+class Episodes:
+    """R episodes of at most T steps.
 
-    Step-level rollouts hold ``action`` and an image per step (:class:`~worldenv_trl.envs.TabletopEnv`). Decision-level
-    ones hold ``("vla_action", "chunk")``, ``step_mask`` and ``frames``, ``states``, ``kinematic_states``
-    [*B, T, C, ...] (:class:`~worldenv_trl.envs.ImaginedEnv`, or ``chunked(env, frames=True)``). Entries outside
-    ``("collector", "mask")`` are left out; without a mask, those after the first ``done``.
+    ``episodes[name]`` gives a small entry, ``episodes[rows]`` (numbers, mask or slice) some of the episodes, which
+    share their frames with these. Entries:
 
-    Returns a TensorDict [R], R rollouts, T the steps of the longest one:
-
-    - ``frames`` uint8 [R, T + 1, 3, H, W], ``states`` float32 [R, T + 1, 7], ``kinematic_states`` float32
-      [R, T + 1, 20]: from the reset on; past the end of an episode the last one is repeated;
+    - ``states`` float32 [R, T + 1, 7], ``kinematic_states`` float32 [R, T + 1, 20]: from the reset on; past the end of
+      an episode the last one is repeated;
     - ``actions`` float32 [R, T, 7]: executed, clipped to [-1, 1]; zero past the end;
-    - ``success`` bool [R, T + 1]: of the physics, repeated past the end; left out where the rollouts carry none
-      (imagination). Decision-level rollouts know it at the last step of each decision; the steps before keep the
-      previous value;
+    - ``success`` bool [R, T + 1]: of the physics, repeated past the end; absent where nobody knows it (imagination);
     - ``length`` int64 [R, 1]: executed steps; ``task_id``, ``context_id`` int64 [R, 1].
 
-    Raises:
-        ValueError: naming the entries that are missing, or rollouts in which nothing was executed.
-    """
-    if rollouts.ndim < 1 or 0 in rollouts.shape:
-        raise ValueError(f"rollouts must be [*B, T] with at least one step, got {list(rollouts.shape)}")
-    rollouts = rollouts.reshape(-1, rollouts.shape[-1]) if rollouts.ndim != 2 else rollouts
-    present = set(rollouts.keys(True, True))
-    decisions = CHUNK in present and ACTION not in present
-    if decisions and ("next", FRAMES) not in present:
-        raise ValueError(
-            "these rollouts hold action chunks without the frames in between: collect them with "
-            "chunked(env, frames=True), or one action a step"
-        )
-    needed = [CHUNK if decisions else ACTION, *_ROOT]
-    needed += [("next", *_path(key)) for key in (FRAMES, STATES, KINEMATIC_STATES, STEP_MASK)] if decisions else []
-    needed += [] if decisions else [("next", *_path(key)) for key in (IMAGE, STATE, KINEMATIC_STATE)]
-    missing = [key for key in needed if key not in present]
-    if missing:
-        raise ValueError(f"the rollouts lack the entries {missing}: they cannot be made into episodes")
+    Frames are read with :meth:`frames` or :meth:`recall`, from a TensorDict in memory or on disk.
 
-    mask = _executed_entries(rollouts)
-    valid = mask.unsqueeze(-1)  # [R, D, C], C = 1 for single steps
-    if decisions:
-        valid = valid & rollouts["next", STEP_MASK]
-    order, length = _compaction(valid.flatten(1))
-    if not bool(length.any()):
-        raise ValueError("the rollouts hold no executed step: their mask is False everywhere")
-    steps = int(length.max())
-    order = order[:, :steps]
-    past_end = torch.arange(steps, device=length.device) >= length  # [R, T]
-
-    def per_step(values: Tensor) -> Tensor:
-        """[R, D, (C,) ...] in the order of execution, [R, T, ...]."""
-        values = values.flatten(1, 2) if decisions else values
-        return values[torch.arange(len(values), device=values.device).unsqueeze(-1), order]
-
-    out = TensorDict(batch_size=[len(rollouts)], device=rollouts.device)
-    for name, inside, single in _OBSERVED:
-        after = per_step(rollouts["next", *_path(inside if decisions else single)])
-        out[name] = _from_reset(rollouts[single][:, 0], after, length)
-    actions = per_step(rollouts[CHUNK] if decisions else rollouts[ACTION]).float().clamp(-1, 1)
-    out["actions"] = actions.masked_fill(past_end.unsqueeze(-1), 0.0)
-    if ("next", SUCCESS) in present:
-        out["success"] = _success(rollouts, valid, per_step, length)
-    out["length"] = length
-    out[TASK_ID], out[CONTEXT_ID] = rollouts[TASK_ID][:, 0].clone(), rollouts[CONTEXT_ID][:, 0].clone()
-    return out
-
-
-def concatenate_episodes(episodes: Sequence[TensorDictBase]) -> TensorDict:
-    """Several sets of episodes as one, padded to the longest: observations repeat the last one, actions are zero.
+    Args:
+        entries: TensorDict [R] of the entries above.
+        instructions: R texts.
+        frames: ``("frames", entry)`` uint8 [F, 3, H, W] by camera: the frames of all episodes, one after the other,
+            from the reset to the last executed step of each.
+        first: int64 [R], which of these is each episode's first; by default they follow each other in order.
 
     Raises:
-        ValueError: for no episodes at all, or sets with other entries or image sizes.
+        ValueError: if the numbers of episodes, texts and frames do not go together.
     """
-    episodes = [part for part in episodes if len(part)]
-    if not episodes:
-        raise ValueError("there are no episodes to concatenate")
-    first = episodes[0]
-    steps = max(part["actions"].shape[1] for part in episodes)
-    for part in episodes[1:]:
-        if set(part.keys()) != set(first.keys()):
-            names = [sorted(map(str, each.keys())) for each in (first, part)]
+
+    def __init__(
+        self,
+        entries: TensorDictBase,
+        instructions: Sequence[str],
+        frames: TensorDictBase,
+        first: Tensor | None = None,
+    ) -> None:
+        count = entries["length"].squeeze(-1) + 1
+        first = count.cumsum(0) - count if first is None else first
+        if len(instructions) != len(entries):
+            raise ValueError(f"{len(entries)} episodes need as many instructions, got {len(instructions)}")
+        if len(first) and int((first + count).max()) > len(frames):
+            raise ValueError(f"the episodes need {int((first + count).max())} frames, there are {len(frames)}")
+        self.entries, self.instructions = entries, list(instructions)
+        self._parts, self._part, self._first = [frames], torch.zeros_like(first), first
+
+    # ------------------------------------------------------------------------------------------------- reading
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.entries.keys()  # noqa: SIM118 - a TensorDict iterates over rows
+
+    def __getitem__(self, item: str | slice | Tensor | Sequence[int]) -> Tensor | Episodes:
+        if isinstance(item, str):
+            return self.entries[item]
+        rows = torch.arange(len(self))[item]
+        return self._with(self.entries[rows], [self.instructions[row] for row in rows.tolist()], rows)
+
+    def __setitem__(self, name: str, value: Tensor) -> None:
+        self.entries[name] = value
+
+    def _with(self, entries: TensorDictBase, instructions: list[str], rows: Tensor) -> Episodes:
+        out = Episodes.__new__(Episodes)
+        out.entries, out.instructions = entries, instructions
+        out._parts, out._part, out._first = self._parts, self._part[rows], self._first[rows]
+        return out
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Scene cameras of which there are frames."""
+        return tuple(camera_of(entry) for entry in self._parts[0][FRAMES].keys())  # noqa: SIM118
+
+    @property
+    def image_size(self) -> int:
+        """Height and width of the frames (px)."""
+        return self._parts[0][frames_key(self.cameras[0])].shape[-1]
+
+    @property
+    def alive(self) -> Tensor:
+        """Which frames belong to their episode: bool [R, T + 1]."""
+        return torch.arange(self["actions"].shape[1] + 1) <= self["length"]
+
+    @property
+    def video(self) -> tuple[TensorDictBase, Tensor]:
+        """All frames [F] and, int64 [R], which of them is each episode's first.
+
+        Raises:
+            ValueError: for episodes that were put together from several stores.
+        """
+        if len(self._parts) > 1:
+            raise ValueError("these episodes come from several stores: fill one from all recordings, with fill_store")
+        return self._parts[0], self._first
+
+    def frames(self, camera: str, episode: Tensor, frame: Tensor) -> Tensor:
+        """Frames of one camera, uint8 [*B, 3, H, W].
+
+        Args:
+            camera: of :attr:`cameras`.
+            episode, frame: int64, broadcast to [*B]; past its end an episode shows its last frame.
+        """
+        part, index = self._places(episode, frame)
+        return self._gather(frames_key(camera), part, index)
+
+    def recall(self, episode: Tensor, frame: Tensor) -> TensorDict:
+        """Frames of all cameras, TensorDict [*B] of ``("frames", entry)``; see :meth:`frames`."""
+        part, index = self._places(episode, frame)
+        out = TensorDict(batch_size=index.shape)
+        for camera in self.cameras:
+            out[frames_key(camera)] = self._gather(frames_key(camera), part, index)
+        return out
+
+    def _places(self, episode: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
+        episode, frame = torch.broadcast_tensors(torch.as_tensor(episode), torch.as_tensor(frame))
+        inside = torch.minimum(frame, self["length"].squeeze(-1)[episode])
+        return self._part[episode], self._first[episode] + inside
+
+    def _gather(self, key: tuple[str, str], part: Tensor, index: Tensor) -> Tensor:
+        if len(self._parts) == 1:
+            return self._parts[0][key][index]
+        out = None
+        for number, frames in enumerate(self._parts):
+            here = part == number
+            found = frames[key][index[here]]
+            out = found.new_empty(*index.shape, *found.shape[1:]) if out is None else out
+            out[here] = found
+        return out
+
+    # ------------------------------------------------------------------------------------------------- together
+
+    def with_video(self, frames: TensorDictBase, **entries: Tensor) -> Episodes:
+        """The same episodes with other frames, ``("frames", entry)`` [F, 3, H, W] in their order, and other entries."""
+        changed = self.entries.clone(False)
+        for name, value in entries.items():
+            changed[name] = value
+        return Episodes(changed, self.instructions, frames)
+
+    def through(self, cameras: Sequence[str]) -> Episodes:
+        """The same episodes as some of their cameras show them.
+
+        Raises:
+            ValueError: for a camera of which there are no frames.
+        """
+        missing = [camera for camera in cameras if camera not in self.cameras]
+        if missing:
+            raise ValueError(f"the episodes show {', '.join(self.cameras)}, not {', '.join(missing)}")
+        if tuple(cameras) == self.cameras:
+            return self
+        out = self._with(self.entries, self.instructions, torch.arange(len(self)))
+        out._parts = [part.select(*(frames_key(camera) for camera in cameras)) for part in self._parts]
+        return out
+
+    @staticmethod
+    def cat(parts: Sequence[Episodes]) -> Episodes:
+        """Several sets of episodes as one, which reads each one's frames where they are.
+
+        Raises:
+            ValueError: for no episodes at all, or sets with other entries, cameras or image sizes.
+        """
+        parts = [part for part in parts if len(part)]
+        if not parts:
+            raise ValueError("there are no episodes to put together")
+        _check_alike(parts)
+        texts = [text for part in parts for text in part.instructions]
+        out = Episodes.__new__(Episodes)
+        out.entries, out.instructions = concatenated([part.entries for part in parts]), texts
+        stores: list[TensorDictBase] = []
+        numbers = []
+        for part in parts:
+            places = []
+            for frames in part._parts:
+                known = next((place for place, each in enumerate(stores) if each is frames), len(stores))
+                if known == len(stores):
+                    stores.append(frames)
+                places.append(known)
+            numbers.append(torch.tensor(places)[part._part])
+        out._parts, out._part = stores, torch.cat(numbers)
+        out._first = torch.cat([part._first for part in parts])
+        return out
+
+
+def _check_alike(parts: Sequence[Episodes]) -> None:
+    first = parts[0]
+    for part in parts[1:]:
+        if set(part.entries.keys()) != set(first.entries.keys()):
+            names = [sorted(map(str, each.entries.keys())) for each in (first, part)]
             raise ValueError(
                 f"episodes hold different entries, {names[0]} and {names[1]}: "
                 "episodes of the physics carry success labels, imagined ones none until they are given"
             )
-        if part["frames"].shape[2:] != first["frames"].shape[2:]:
-            sizes = [list(each["frames"].shape[2:]) for each in (first, part)]
-            raise ValueError(f"episodes hold frames of different sizes, {sizes[0]} and {sizes[1]}: record them alike")
-    count = sum(len(part) for part in episodes)
-    out = TensorDict(batch_size=[count], device=first.device)
-    for key in first.keys():  # noqa: SIM118 - a TensorDict iterates over rows
-        per_step = key not in ("length", TASK_ID, CONTEXT_ID)
-        sample = first[key]
-        if not per_step:
-            out[key] = torch.cat([part[key] for part in episodes])
+        if (set(part.cameras), part.image_size) != (set(first.cameras), first.image_size):
+            seen = [f"{', '.join(each.cameras)} at {each.image_size} px" for each in (first, part)]
+            raise ValueError(
+                f"episodes hold frames of different cameras or sizes, {seen[0]} and {seen[1]}: record alike"
+            )
+
+
+def concatenated(parts: Sequence[TensorDictBase]) -> TensorDict:
+    """Entries [R] of several sets, padded to the longest: observations repeat the last one, actions are zero."""
+    steps = max(part["actions"].shape[1] for part in parts)
+    count = sum(len(part) for part in parts)
+    out = TensorDict(batch_size=[count])
+    for key in parts[0].keys():  # noqa: SIM118 - a TensorDict iterates over rows
+        if key in ONCE:
+            out[key] = torch.cat([part[key] for part in parts])
             continue
         extra = 0 if key == "actions" else 1
+        sample = parts[0][key]
         values = sample.new_zeros(count, steps + extra, *sample.shape[2:])
         start = 0
-        for part in episodes:
+        for part in parts:
             rows, have = slice(start, start + len(part)), part[key].shape[1]
             values[rows, :have] = part[key]
             if extra:
@@ -137,53 +229,3 @@ def concatenate_episodes(episodes: Sequence[TensorDictBase]) -> TensorDict:
             start += len(part)
         out[key] = values
     return out
-
-
-def _path(key: str | tuple[str, ...]) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else key
-
-
-def _executed_entries(rollouts: TensorDictBase) -> Tensor:
-    """Which entries belong to a rollout: bool [R, T]."""
-    mask = rollouts.get(MASK, None)
-    if mask is not None:
-        return mask.reshape(rollouts.shape).bool()
-    done = rollouts.get(("next", "done"), None)
-    if done is None:
-        return torch.ones(rollouts.shape, dtype=torch.bool, device=rollouts.device)
-    done = done.reshape(rollouts.shape).long()
-    return (done.cumsum(-1) - done) == 0
-
-
-def _compaction(valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Indices [R, S] that bring the executed steps of [R, S] forward in their order, and their number [R, 1].
-
-    Indices past the number repeat the last executed step.
-    """
-    length = valid.sum(-1, keepdim=True)
-    order = (~valid).to(torch.uint8).argsort(dim=-1, stable=True)
-    place = torch.arange(valid.shape[-1], device=valid.device).expand_as(order)
-    return order.gather(-1, torch.minimum(place, (length - 1).clamp(min=0))), length
-
-
-def _from_reset(first: Tensor, after: Tensor, length: Tensor) -> Tensor:
-    """[R, ...] at the reset and [R, T, ...] after each step -> [R, T + 1, ...]."""
-    out = after.new_empty(after.shape[0], after.shape[1] + 1, *after.shape[2:])
-    out[:, 0], out[:, 1:] = first, after
-    empty = (length.squeeze(-1) == 0).nonzero().squeeze(-1)
-    out[empty] = out[empty, :1].expand_as(out[empty])  # nothing was executed: the reset is all there is
-    return out
-
-
-def _success(rollouts: TensorDictBase, valid: Tensor, per_step, length: Tensor) -> Tensor:
-    """bool [R, T + 1]."""
-    after = rollouts["next", SUCCESS].reshape(rollouts.shape)
-    before = rollouts.get(SUCCESS, None)
-    before = torch.zeros_like(after) if before is None else before.reshape(rollouts.shape)
-    if valid.shape[-1] == 1:
-        steps = per_step(after)
-    else:
-        place = torch.arange(valid.shape[-1], device=valid.device)
-        last = place == valid.sum(-1, keepdim=True) - 1  # [R, D, C]: the decision's last executed step
-        steps = per_step(torch.where(last, after.unsqueeze(-1), before.unsqueeze(-1)))
-    return _from_reset(before[:, 0], steps, length)

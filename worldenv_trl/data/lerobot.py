@@ -19,7 +19,7 @@ from torch import Tensor
 from worldenv_trl.data.lerobot_stats import episode_stats, joined_stats
 from worldenv_trl.data.lerobot_video import write_video
 from worldenv_trl.keys import CONTROL_HZ, INSTRUCTION, MASK, SUCCESS
-from worldenv_trl.record.layout import executed_entries, leaves, to_bytes
+from worldenv_trl.record.mcap.layout import executed_entries, leaves, to_bytes
 
 __all__ = ["write_lerobot"]
 

@@ -1,21 +1,23 @@
-"""Behaviour-cloning samples: every executed step of an episode with the chunk of actions that follows."""
+"""Action chunks to imitate, from episodes."""
 
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NonTensorStack, TensorDict
 
-from worldenv_trl.keys import ACTION_IS_PAD, CHUNK, CHUNK_LENGTH, IMAGE, STATE, TASK_ID
+from worldenv_trl.data.episodes import Episodes
+from worldenv_trl.keys import ACTION_IS_PAD, CHUNK, CHUNK_LENGTH, INSTRUCTION, STATE, image_key
 
 __all__ = ["policy_samples"]
 
 
-def policy_samples(episodes: TensorDictBase, chunk_length: int = CHUNK_LENGTH) -> TensorDict:
-    """One sample for each executed step of ``episodes`` [R] (:func:`~worldenv_trl.data.episodes_from_rollouts`).
+def policy_samples(episodes: Episodes, chunk_length: int = CHUNK_LENGTH) -> TensorDict:
+    """One sample for each executed step of ``episodes``.
 
-    Returns a TensorDict [N], episode after episode: ``("observation", "image")`` uint8 [N, 3, H, W],
-    ``("observation", "state")`` [N, 7], ``task_id`` [N, 1], ``("vla_action", "chunk")`` [N, C, 7] with the actions from
-    this step on, and ``action_is_pad`` bool [N, C], True past the end of the episode, where the last action repeats.
+    Returns a TensorDict [N], episode after episode: ``("observation", ...)`` uint8 [N, 3, H, W] of every camera,
+    ``("observation", "state")`` [N, 7], ``language_instruction``, ``("vla_action", "chunk")`` [N, C, 7] with the
+    actions from this step on, and ``action_is_pad`` bool [N, C], True past the end of the episode, where the last
+    action repeats.
 
     Raises:
         ValueError: for a chunk shorter than one step, or episodes in which nothing was executed.
@@ -30,14 +32,9 @@ def policy_samples(episodes: TensorDictBase, chunk_length: int = CHUNK_LENGTH) -
     wanted = step.unsqueeze(-1) + torch.arange(chunk_length, device=step.device)  # [N, C]
     end = length[episode]
     chunk = episodes["actions"][episode.unsqueeze(-1), torch.minimum(wanted, end - 1)]
-    return TensorDict(
-        {
-            IMAGE: episodes["frames"][episode, step],
-            STATE: episodes["states"][episode, step],
-            TASK_ID: episodes[TASK_ID][episode],
-            CHUNK: chunk,
-            ACTION_IS_PAD: wanted >= end,
-        },
-        batch_size=[len(episode)],
-        device=episodes.device,
-    )
+    out = TensorDict({STATE: episodes["states"][episode, step]}, batch_size=[len(episode)])
+    for camera in episodes.cameras:
+        out[image_key(camera)] = episodes.frames(camera, episode, step)
+    out.set(INSTRUCTION, NonTensorStack(*(episodes.instructions[row] for row in episode.tolist())))
+    out[CHUNK], out[ACTION_IS_PAD] = chunk, wanted >= end
+    return out

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NonTensorStack, TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import ReplayBuffer, TensorStorage
+from torchrl.data.replay_buffers.samplers import Sampler
+from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 
-from worldenv_trl.keys import ACTION_DIM, TASK_ID
+from worldenv_trl.data.episodes import Episodes
+from worldenv_trl.data.store import release
+from worldenv_trl.keys import FRAMES, INSTRUCTION, TASK_ID
 from worldenv_trl.kinematics import ForwardKinematics
-from worldenv_trl.world_models import VideoWorldModel
+from worldenv_trl.world_models import WorldModel
 
-__all__ = ["WindowSampler", "predicted_poses", "world_model_windows"]
+__all__ = ["WindowBuffer", "WindowSampler", "predicted_poses", "window_buffer"]
 
-_PADDED_ACTION_DIM = 14  # the world model's dual-arm interface; a single arm fills the first seven
+_RELEASE_EVERY = 32  # samples; what they show of the files is then given back
 
 
 @torch.no_grad()
-def predicted_poses(episodes: TensorDictBase, kinematics: ForwardKinematics) -> Tensor:
+def predicted_poses(episodes: Episodes, kinematics: ForwardKinematics) -> Tensor:
     """Poses [R, T + 1, 13] of the hand, predicted open loop from each episode's first kinematic state and its actions.
 
     These, not the measured ones, condition the world model: in imagination there is nothing to measure (World-Env
@@ -27,67 +34,7 @@ def predicted_poses(episodes: TensorDictBase, kinematics: ForwardKinematics) -> 
     return kinematics.pose(torch.cat([first.unsqueeze(1), after], 1))
 
 
-def world_model_windows(
-    episodes: TensorDictBase,
-    poses: Tensor,
-    world_model: VideoWorldModel,
-    episode: Tensor,
-    start: Tensor,
-    *,
-    chunks: int = 2,
-) -> TensorDict:
-    """The windows of ``chunks`` consecutive chunks that begin at the given frames: the input of ``DiffusionLoss``.
-
-    Args:
-        episodes: TensorDict [R], see :func:`~worldenv_trl.data.episodes_from_rollouts`.
-        poses: [R, T + 1, 13], see :func:`predicted_poses`.
-        world_model: its ``memory_indices`` says which frames are remembered, its ``chunk_length`` is C.
-        episode: int64 [B], which episode.
-        start: int64 [B], the frame t after which the window begins; 0 is the reset.
-
-    Returns a TensorDict [B]: ``("memory", "frames")`` uint8 [B, M, 3, H, W], ``("memory", "poses")`` [B, M, 13],
-    ``("memory", "reference")`` uint8 [B, 3, H, W] (the episode's first frame), ``poses`` [B, n C, 13],
-    ``padded_actions`` [B, n C, 14], ``target_frames`` uint8 [B, n C, 3, H, W], ``target_mask`` bool [B, n C] (False
-    past the end of the episode, where the last frame repeats) and ``task_id`` [B, 1].
-
-    Raises:
-        ValueError: for a start outside its episode.
-    """
-    length = episodes["length"][episode].squeeze(-1)  # [B]
-    outside = (start < 0) | (start > length)
-    if bool(outside.any()):
-        row = int(outside.nonzero()[0])
-        raise ValueError(
-            f"a window starts at frame {int(start[row])} of episode {int(episode[row])}, which has frames 0 to "
-            f"{int(length[row])}"
-        )
-    rows = episode.unsqueeze(-1)
-    memory = world_model.memory_indices(start)
-    step = start.unsqueeze(-1) + torch.arange(chunks * world_model.chunk_length, device=start.device)  # [B, n C]
-    end = length.unsqueeze(-1)
-    seen = torch.minimum(step + 1, end)
-    inside = step < end
-    actions = episodes["actions"][rows, step.clamp(max=episodes["actions"].shape[1] - 1)] * inside.unsqueeze(-1)
-    frames = episodes["frames"]
-    return TensorDict(
-        {
-            "memory": {
-                "frames": frames[rows, memory],
-                "poses": poses[rows, memory],
-                "reference": frames[episode, 0],
-            },
-            "poses": poses[rows, seen],
-            "padded_actions": torch.nn.functional.pad(actions, (0, _PADDED_ACTION_DIM - ACTION_DIM)),
-            "target_frames": frames[rows, seen],
-            "target_mask": inside,
-            TASK_ID: episodes[TASK_ID][episode],
-        },
-        batch_size=[len(episode)],
-        device=frames.device,
-    )
-
-
-class WindowSampler:
+class WindowSampler(Sampler):
     """Draws windows of the episodes, every frame that leaves room for a chunk being as likely a start as any other.
 
     A model that sees successes far more often than failures paints a success whenever it is in doubt, and a policy that
@@ -98,9 +45,8 @@ class WindowSampler:
     a share of the windows starts there on purpose.
 
     Args:
-        episodes: TensorDict [R] of at least one executed step.
-        kinematics: FK(s, a); poses are predicted once, here.
-        world_model: the model to train.
+        episodes: at least one executed step.
+        world_model: says which frames it remembers, and its chunk length.
 
     Keyword Args:
         chunks: consecutive chunks in a window.
@@ -109,14 +55,13 @@ class WindowSampler:
         seed: of the draws; from torch's generator when None.
 
     Raises:
-        ValueError: for episodes without a step, frames of another size than the model's, or settings out of range.
+        ValueError: for episodes without a step, or settings out of range.
     """
 
     def __init__(
         self,
-        episodes: TensorDictBase,
-        kinematics: ForwardKinematics,
-        world_model: VideoWorldModel,
+        episodes: Episodes,
+        world_model: WorldModel,
         *,
         chunks: int = 2,
         reset_share: float = 0.125,
@@ -132,13 +77,10 @@ class WindowSampler:
         length = episodes["length"].squeeze(-1)
         if not len(episodes) or not bool(length.any()):
             raise ValueError(f"the {len(episodes)} episodes hold no executed step: there is no window to draw")
-        size, frames = world_model.config.image_size, episodes["frames"]
-        if tuple(frames.shape[2:]) != (3, size, size):
-            raise ValueError(f"the world model sees {size} px images, the episodes' are {tuple(frames.shape[2:])}")
-        self.episodes, self.world_model = episodes, world_model
         self.chunks, self.reset_share = chunks, reset_share
-        self.poses = predicted_poses(episodes, kinematics)
-        self._starts = ((length - world_model.chunk_length).clamp(min=0) + 1) * (length > 0)  # [R]
+        self._length, self._first = length, episodes.video[1]
+        self._memory_indices, self.chunk_length = world_model.memory_indices, world_model.chunk_length
+        self._starts = ((length - self.chunk_length).clamp(min=0) + 1) * (length > 0)  # [R]
         self._weights = _window_weights(episodes, self._starts, failure_share)
         self._generator = torch.Generator()
         self._generator.manual_seed(int(torch.randint(2**31, ()).item()) if seed is None else seed)
@@ -147,23 +89,144 @@ class WindowSampler:
         """Distinct windows."""
         return int(self._starts.sum())
 
-    def sample(self, batch_size: int) -> TensorDict:
-        """``batch_size`` windows, with replacement; see :func:`world_model_windows`."""
+    def sample(self, storage: Any, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """Frames int64 [B, K] of ``batch_size`` windows, and what they are: ``episode`` and ``start`` [B], ``number``
+        [B, K], the frames' numbers in their episode (past its end they show its last frame)."""
         episode = torch.multinomial(self._weights, batch_size, replacement=True, generator=self._generator)
         place = torch.rand(batch_size, generator=self._generator)
         at_reset = torch.rand(batch_size, generator=self._generator) < self.reset_share
-        episode, place, at_reset = (value.to(self._starts.device) for value in (episode, place, at_reset))
         start = torch.minimum((place * self._starts[episode]).long(), self._starts[episode] - 1)
         start = start.masked_fill(at_reset, 0)
-        return world_model_windows(self.episodes, self.poses, self.world_model, episode, start, chunks=self.chunks)
+        return self.window(episode, start)
+
+    def window(self, episode: Tensor, start: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The windows that begin after frame ``start`` [B] of ``episode`` [B]; see :meth:`sample`.
+
+        Raises:
+            ValueError: for a start outside its episode.
+        """
+        length = self._length[episode]
+        outside = (start < 0) | (start > length)
+        if bool(outside.any()):
+            row = int(outside.nonzero()[0])
+            raise ValueError(
+                f"a window starts at frame {int(start[row])} of episode {int(episode[row])}, which has frames 0 to "
+                f"{int(length[row])}"
+            )
+        steps = torch.arange(1, self.chunks * self.chunk_length + 1)
+        remembered = [self._memory_indices(start + chunk * self.chunk_length) for chunk in range(self.chunks)]
+        first = torch.zeros_like(start).unsqueeze(-1)  # the reference
+        number = torch.cat([first, *remembered, start.unsqueeze(-1) + steps], 1)
+        index = self._first[episode].unsqueeze(-1) + torch.minimum(number, length.unsqueeze(-1))
+        return index, {"episode": episode, "start": start, "number": number}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The random state."""
+        return {"generator": self._generator.get_state()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self._generator.set_state(state_dict["generator"])
+
+    def _empty(self) -> None:
+        pass
+
+    def dumps(self, path: Any) -> None:
+        """Nothing is kept on disk: :meth:`state_dict` holds the random state."""
+
+    def loads(self, path: Any) -> None:
+        """See :meth:`dumps`."""
 
 
-def _window_weights(episodes: TensorDictBase, starts: Tensor, failure_share: float | None) -> Tensor:
-    """How often each episode is drawn ``[R]``, on the CPU: by its windows, within its task and outcome."""
-    weights = starts.double().cpu()
+class WindowBuffer(ReplayBuffer):
+    """A ReplayBuffer whose samples are training windows; see :func:`window_buffer`."""
+
+    def __init__(self, episodes: Episodes, poses: Tensor, sampler: WindowSampler, batch_size: int) -> None:
+        frames, _ = episodes.video
+        super().__init__(
+            storage=TensorStorage(frames.select(FRAMES)),
+            sampler=sampler,
+            writer=ImmutableDatasetWriter(),
+            batch_size=batch_size,
+        )
+        self._episodes, self._poses, self._drawn = episodes, poses, 0
+
+    def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
+        """Windows [B]; see :func:`window_buffer`."""
+        frames, info = super().sample(batch_size, return_info=True)
+        windows = self.windows(frames, info)
+        self._drawn += 1
+        if self._drawn % _RELEASE_EVERY == 0:
+            release(self._episodes.video[0])
+        return (windows, info) if return_info else windows
+
+    def windows(self, frames: TensorDictBase, info: dict[str, Tensor]) -> TensorDict:
+        """Frames [B, K] and what they are, as windows [B]."""
+        episodes, episode, number = self._episodes, info["episode"], info["number"]
+        length = episodes["length"][episode]  # [B, 1]
+        step = number[:, -self._sampler.chunks * self._sampler.chunk_length :] - 1  # [B, n C]
+        inside = step < length
+        actions, row = episodes["actions"], episode.unsqueeze(-1)
+        out = TensorDict(
+            {
+                FRAMES: frames[FRAMES],
+                "poses": self._poses[row, torch.minimum(number, length)],
+                "number": number,
+                "start": info["start"].unsqueeze(-1),
+                "actions": actions[row, step.clamp(max=actions.shape[1] - 1)] * inside.unsqueeze(-1),
+                "step_mask": inside,
+            },
+            batch_size=[len(episode)],
+        )
+        out.set(INSTRUCTION, NonTensorStack(*(episodes.instructions[index] for index in episode.tolist())))
+        return out
+
+
+def window_buffer(
+    episodes: Episodes,
+    kinematics: ForwardKinematics,
+    world_model: WorldModel,
+    *,
+    batch_size: int = 8,
+    **options: Any,
+) -> WindowBuffer:
+    """A ReplayBuffer over the episodes' frames that draws windows to train ``world_model`` on.
+
+    A sample is a TensorDict [B] as :class:`~worldenv_trl.world_models.Window` reads it: ``("frames", entry)`` uint8
+    [B, K, 3, H, W] of each camera, ``poses`` [B, K, 13] predicted by forward kinematics, ``number`` int64 [B, K],
+    ``start`` int64 [B, 1], ``actions`` [B, n C, 7], ``step_mask`` bool [B, n C] and ``language_instruction``.
+
+    Args:
+        episodes: of one store; its frames may be on disk.
+        kinematics: FK(s, a); poses are predicted once, here.
+        world_model: the model to train.
+
+    Keyword Args:
+        batch_size: B.
+        options: of :class:`WindowSampler`.
+
+    Raises:
+        ValueError: for cameras or frames that are not the model's, episodes without a step, or settings out of range.
+    """
+    missing = [camera for camera in world_model.cameras if camera not in episodes.cameras]
+    if missing:
+        raise ValueError(
+            f"the world model sees through {', '.join(world_model.cameras)}, the episodes show "
+            f"{', '.join(episodes.cameras)}: record with cameras={world_model.cameras}"
+        )
+    if episodes.image_size != world_model.image_size:
+        raise ValueError(
+            f"the world model sees {world_model.image_size} px images, the episodes' are {episodes.image_size} px"
+        )
+    sampler = WindowSampler(episodes, world_model, **options)
+    return WindowBuffer(episodes, predicted_poses(episodes, kinematics), sampler, batch_size)
+
+
+def _window_weights(episodes: Episodes, starts: Tensor, failure_share: float | None) -> Tensor:
+    """How often each episode is drawn ``[R]``: by its windows, within its task and outcome."""
+    weights = starts.double()
     if failure_share is None:
         return weights
-    task, failed = episodes[TASK_ID].squeeze(-1).cpu(), ~episodes["success"].any(-1).cpu()
+    task, failed = episodes[TASK_ID].squeeze(-1), ~episodes["success"].any(-1)
     shared = torch.zeros_like(weights)
     for number in task.unique():
         for outcome, share in ((True, failure_share), (False, 1 - failure_share)):

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from worldenv_trl.context_ids import context_id
     from worldenv_trl.envs.chunking import ChunkedActions, chunked
     from worldenv_trl.envs.expert import ExpertPolicy
+    from worldenv_trl.envs.frames_aside import FramesAside
     from worldenv_trl.envs.imagined import ImaginedEnv
     from worldenv_trl.envs.init_states import InitStates
     from worldenv_trl.envs.reflect import Reflect
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ChunkedActions",
     "ExpertPolicy",
+    "FramesAside",
     "ImaginedEnv",
     "InitStates",
     "Reflect",
@@ -31,6 +33,7 @@ __all__ = [
 _HOMES = {
     "ChunkedActions": "worldenv_trl.envs.chunking",
     "ExpertPolicy": "worldenv_trl.envs.expert",
+    "FramesAside": "worldenv_trl.envs.frames_aside",
     "ImaginedEnv": "worldenv_trl.envs.imagined",
     "InitStates": "worldenv_trl.envs.init_states",
     "Reflect": "worldenv_trl.envs.reflect",

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import torch
 from tensordict import NonTensorStack, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, NonTensor, Unbounded
 from torchrl.envs import EnvBase
 
-from worldenv_trl.envs.contexts import CONTEXT_KEYS, check_contexts, instructions_of
+from worldenv_trl.envs.contexts import check_contexts, context_keys
+from worldenv_trl.envs.imagined_specs import imagined_specs
+from worldenv_trl.envs.noise_seeds import noise_seeds
 from worldenv_trl.keys import (
     ACTION_DIM,
     CHUNK,
     CONTEXT_ID,
     FRAMES,
-    IMAGE,
     INSTRUCTION,
     KINEMATIC_DIM,
     KINEMATIC_STATE,
@@ -28,12 +27,15 @@ from worldenv_trl.keys import (
     STATES,
     STEP_MASK,
     TASK_ID,
+    frames_key,
+    image_entry,
+    image_key,
 )
 from worldenv_trl.kinematics import ForwardKinematics
+from worldenv_trl.language import instructions_of
+from worldenv_trl.world_models import WorldModel, request
 
 __all__ = ["ImaginedEnv"]
-
-_PADDED_ACTION_DIM = 14  # the world model's dual-arm interface; a single arm fills the first seven
 
 
 class ImaginedEnv(EnvBase):
@@ -45,22 +47,18 @@ class ImaginedEnv(EnvBase):
     active rows only.
 
     A rollout is a function of (seed, context, rollout index, how often this row was reset, actions), never of the other
-    rows: the world model gets a noise seed per row and chunk.
+    rows: the world model gets a noise seed per row and chunk. Of a rollout's frames those are kept that the world model
+    will ask for (its ``memory_indices`` at whole chunks); the others are shown once, in ``frames``.
 
     Args:
-        world_model: called on a TensorDict [n] of the active rows with ``("memory", "frames")`` uint8 [n, M, 3, H, W],
-            ``("memory", "poses")`` [n, M, 13], ``("memory", "reference")`` uint8 [n, 3, H, W], ``poses`` [n, C, 13],
-            ``padded_actions`` [n, C, 14], ``task_id`` [n, 1] and ``noise_seed`` int64 [n, 1]; writes ``frames`` uint8
-            [n, C, 3, H, W]. ``world_model.memory_indices(t)``, int64 [n] -> [n, M], says which frames of the video
-            o_0..o_t it remembers, newest last.
+        world_model: paints the active rows. Its cameras, image size and chunk length are the env's.
         kinematics: FK(s, a).
-        contexts: TensorDict [K] with the image, state, kinematic state, task id, context id and instruction of K
-            initial states, as :class:`~worldenv_trl.envs.TabletopEnv` writes them at a reset.
+        contexts: TensorDict [K] with the images of the model's cameras, state, kinematic state, task id, context id and
+            instruction of K initial states, as :class:`~worldenv_trl.envs.TabletopEnv` writes them at a reset.
         batch_size: [G, N].
 
     Keyword Args:
         max_steps: env steps after which a rollout is truncated; need not be a multiple of the chunk.
-        chunk_length: C.
         proprio: ``"commanded"`` writes the accumulated target pose as the state (the same number as in physics),
             ``"measured"`` the pose of the predicted joints.
         seed: of the contexts' order and of the noise; drawn from torch's generator when None.
@@ -75,13 +73,12 @@ class ImaginedEnv(EnvBase):
 
     def __init__(
         self,
-        world_model: TensorDictModuleBase,
+        world_model: WorldModel,
         kinematics: ForwardKinematics,
         contexts: TensorDictBase,
         batch_size: torch.Size | list[int] | tuple[int, int],
         *,
         max_steps: int,
-        chunk_length: int = 8,
         proprio: str = "commanded",
         seed: int | None = None,
         device: torch.device | str | None = None,
@@ -89,79 +86,37 @@ class ImaginedEnv(EnvBase):
         batch = torch.Size(batch_size)
         if len(batch) != 2 or min(batch) < 1:
             raise ValueError(f"batch_size must be [contexts, rollouts of each], both at least 1, got {list(batch)}")
-        if max_steps < 1 or chunk_length < 1:
-            raise ValueError(f"max_steps and chunk_length must be at least 1, got {max_steps} and {chunk_length}")
+        if max_steps < 1:
+            raise ValueError(f"max_steps must be at least 1, got {max_steps}")
         if proprio not in ("commanded", "measured"):
             raise ValueError(f'proprio must be "commanded" or "measured", got {proprio!r}')
-        check_contexts(contexts, kinematics)
-        trained_for = getattr(world_model, "chunk_length", chunk_length)
-        if trained_for != chunk_length:
-            raise ValueError(f"the world model paints chunks of {trained_for} frames, chunk_length is {chunk_length}")
-        side, image = getattr(world_model, "image_size", None), tuple(contexts[IMAGE].shape[-2:])
-        if side is not None and image != (side, side):
-            raise ValueError(f"the world model paints frames of {side} px, the contexts' images are {image}")
+        check_contexts(contexts, kinematics, world_model.cameras, world_model.image_size)
         device = torch.device(device or contexts.device or "cpu")
         super().__init__(device=device, batch_size=batch)
 
         self.world_model, self.kinematics = world_model, kinematics
-        self.max_steps, self.chunk_length, self.proprio = int(max_steps), int(chunk_length), proprio
-        self._contexts = contexts.select(*CONTEXT_KEYS).to(device).contiguous()
+        self.cameras, self.image_size = tuple(world_model.cameras), world_model.image_size
+        self.max_steps, self.chunk_length, self.proprio = int(max_steps), world_model.chunk_length, proprio
+        self._contexts = contexts.select(*context_keys(self.cameras)).to(device).contiguous()
         self._instructions = instructions_of(contexts)
-        self._make_specs(tuple(self._contexts[IMAGE].shape[1:]))
-        self._make_buffers(tuple(self._contexts[IMAGE].shape[1:]))
+        specs = imagined_specs(batch, self.cameras, self.image_size, self.chunk_length, self._instructions[0], device)
+        self.observation_spec, self.state_spec, self.action_spec, self.reward_spec, self.done_spec = specs
+        self._make_buffers()
         self._set_seed(seed)
 
     # ------------------------------------------------------------------------------------------------- set-up
 
-    def _make_specs(self, image: tuple[int, ...]) -> None:
-        batch, chunk = self.batch_size, self.chunk_length
-
-        def pixels(*shape: int) -> Bounded:
-            return Bounded(0, 255, shape=(*batch, *shape), dtype=torch.uint8, device=self.device)
-
-        def real(*shape: int) -> Unbounded:
-            return Unbounded(shape=(*batch, *shape), device=self.device)
-
-        def integer() -> Unbounded:
-            return Unbounded(shape=(*batch, 1), dtype=torch.int64, device=self.device)
-
-        def nested(**leaves) -> Composite:
-            return Composite(**leaves, shape=batch, device=self.device)
-
-        text = NonTensor(shape=batch, example_data=self._instructions[0], device=self.device)
-        state = {
-            "observation": nested(image=pixels(*image), state=real(STATE_DIM)),
-            KINEMATIC_STATE: real(KINEMATIC_DIM),
-            INSTRUCTION: text,
-            TASK_ID: integer(),
-            CONTEXT_ID: integer(),
-        }
-        self.observation_spec = nested(
-            **state,
-            **{
-                NUM_STEPS: integer(),
-                FRAMES: pixels(chunk, *image),
-                STATES: real(chunk, STATE_DIM),
-                KINEMATIC_STATES: real(chunk, KINEMATIC_DIM),
-                NOISE_SEED: integer(),
-                STEP_MASK: Binary(shape=(*batch, chunk), dtype=torch.bool, device=self.device),
-            },
-        )
-        self.state_spec = nested(**state).clone()
-        self.action_spec = nested(
-            vla_action=nested(chunk=Bounded(-1.0, 1.0, shape=(*batch, chunk, ACTION_DIM), device=self.device))
-        )
-        self.reward_spec = real(1)
-        flag = Binary(shape=(*batch, 1), dtype=torch.bool, device=self.device)
-        self.done_spec = nested(done=flag.clone(), terminated=flag.clone(), truncated=flag.clone())
-
-    def _make_buffers(self, image: tuple[int, ...]) -> None:
+    def _make_buffers(self) -> None:
         rows, length = self.batch_size.numel(), self.max_steps + self.chunk_length  # the last chunk may overshoot
+        image = (3, self.image_size, self.image_size)
 
         def buffer(name: str, *shape: int, dtype: torch.dtype) -> None:
             self.register_buffer(name, torch.zeros(rows, *shape, dtype=dtype, device=self.device), persistent=False)
 
-        buffer("_video", length, *image, dtype=torch.uint8)  # o_0..o_t of every row: the world model's memory
+        kept, self._slot = self._remembered(length)
+        for camera in self.cameras:
+            buffer(f"_memory_{camera}", kept, *image, dtype=torch.uint8)
+            buffer(f"_image_{camera}", *image, dtype=torch.uint8)
         buffer("_poses", length, POSE_DIM, dtype=torch.float32)
         buffer("_kinematic", 2, KINEMATIC_DIM, dtype=torch.float32)  # at the start, now
         buffer("_state", 2, STATE_DIM, dtype=torch.float32)
@@ -174,6 +129,24 @@ class ImaginedEnv(EnvBase):
         self._text = [self._instructions[0]] * rows
         self._text_stack: NonTensorStack | None = None
         self._begun = [False] * self.batch_size[0]  # groups that have a context
+
+    def _remembered(self, length: int) -> tuple[int, Tensor]:
+        """How many frames of a rollout the world model will ever ask for, and where each is kept: int64 [length], -1
+        for those that are not."""
+        decisions = torch.arange(0, self.max_steps, self.chunk_length)
+        wanted = torch.cat([torch.zeros(1, dtype=torch.int64), self.world_model.memory_indices(decisions).flatten()])
+        numbers = wanted.unique()
+        slot = torch.full((length,), -1)
+        slot[numbers] = torch.arange(len(numbers))
+        return len(numbers), slot.to(self.device)
+
+    def _kept(self, camera: str) -> Tensor:
+        """The frames that may be asked for: uint8 [G * N, K, 3, H, W]."""
+        return self.get_buffer(f"_memory_{camera}")
+
+    def _image(self, camera: str) -> Tensor:
+        """What is seen now: uint8 [G * N, 3, H, W]."""
+        return self.get_buffer(f"_image_{camera}")
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = int(torch.randint(2**31, ()).item()) if seed is None else int(seed)
@@ -235,7 +208,8 @@ class ImaginedEnv(EnvBase):
     def _load(self, rows: Tensor, start: TensorDictBase, text: list[str]) -> None:
         """Put the contexts ``start`` [n] into ``rows`` [n]."""
         start = start.to(self.device)
-        self._video[rows, 0] = start[IMAGE]
+        for camera in self.cameras:
+            self._kept(camera)[rows, 0] = self._image(camera)[rows] = start[image_key(camera)]
         self._state[rows] = start[STATE].unsqueeze(1)
         self._kinematic[rows] = start[KINEMATIC_STATE].unsqueeze(1)
         self._poses[rows, 0] = self.kinematics.pose(start[KINEMATIC_STATE])
@@ -247,16 +221,19 @@ class ImaginedEnv(EnvBase):
     def _given(self, tensordict: TensorDictBase | None, rows: Tensor) -> tuple[TensorDictBase, list[str]]:
         """The contexts of ``rows`` that the caller put into the reset's tensordict."""
         keys = set() if tensordict is None else set(tensordict.keys(True, True))
-        missing = [key for key in CONTEXT_KEYS if key not in keys]
+        needed = context_keys(self.cameras)
+        missing = [key for key in needed if key not in keys]
         if missing:
-            raise ValueError(f"reset(set_state=True) needs {list(CONTEXT_KEYS)} in its tensordict; missing: {missing}")
-        start = tensordict.select(*CONTEXT_KEYS).to(self.device).flatten(0, 1)[rows]
-        if start[IMAGE].shape[1:] != self._video.shape[2:]:
-            raise ValueError(
-                f"the contexts' images are {tuple(start[IMAGE].shape[1:])}, this env's {tuple(self._video.shape[2:])}"
-            )
+            raise ValueError(f"reset(set_state=True) needs {needed} in its tensordict; missing: {missing}")
+        start = tensordict.select(*needed).to(self.device).flatten(0, 1)[rows]
+        size = (3, self.image_size, self.image_size)
+        for camera in self.cameras:
+            if tuple(start[image_key(camera)].shape[1:]) != size:
+                raise ValueError(
+                    f"the contexts' {image_key(camera)} is {tuple(start[image_key(camera)].shape[1:])}, not {size}"
+                )
         if INSTRUCTION in tensordict.keys():  # noqa: SIM118 - a TensorDict iterates over rows
-            text = instructions_of(tensordict.select(INSTRUCTION).flatten(0, 1))
+            text = instructions_of(tensordict)
             return start, [text[row] for row in rows.tolist()]
         by_task = dict(zip(self._contexts[TASK_ID].flatten().tolist(), self._instructions, strict=True))
         return start, [by_task.get(task, "") for task in start[TASK_ID].flatten().tolist()]
@@ -289,52 +266,54 @@ class ImaginedEnv(EnvBase):
         kinematic = self.kinematics.rollout(self._kinematic[rows, 1], actions)
         poses = self.kinematics.pose(kinematic)
         states = self.kinematics.state(kinematic, self.proprio)
-        memory = self.world_model.memory_indices(now)
-        recalled, seeds = rows.unsqueeze(-1), self._noise_seeds(rows)
-        request = TensorDict(
-            {
-                "memory": {
-                    "frames": self._video[recalled, memory],
-                    "poses": self._poses[recalled, memory],
-                    "reference": self._video[rows, 0],
-                },
-                "poses": poses,
-                "padded_actions": torch.nn.functional.pad(actions, (0, _PADDED_ACTION_DIM - ACTION_DIM)),
-                TASK_ID: self._task[rows],
-                NOISE_SEED: seeds,
-            },
-            batch_size=[count],
-            device=self.device,
-        )
-        frames = self.world_model(request)[FRAMES]
-        expected = (count, length, *self._video.shape[2:])
-        if tuple(frames.shape) != expected or frames.dtype != torch.uint8:
-            raise ValueError(
-                f"the world model must write uint8 frames {expected}, got {frames.dtype} {tuple(frames.shape)}"
-            )
-
+        row, seeds = rows.unsqueeze(-1), self._noise_seeds(rows)
+        text = [self._text[index] for index in rows.tolist()]
+        asked = request(self.world_model, lambda numbers: self._recall(row, numbers), now, poses, actions, text, seeds)
+        painted = self.world_model(asked)
         offset = torch.arange(1, length + 1, device=self.device)
         written = now.unsqueeze(-1) + offset
-        self._video[recalled, written] = frames
-        self._poses[recalled, written] = poses
+        frames = {camera: self._checked_frames(painted, camera, count) for camera in self.cameras}
+        slot = self._slot[written]
+        of, step = (slot >= 0).nonzero(as_tuple=True)
+        for camera, video in frames.items():
+            self._kept(camera)[rows[of], slot[of, step]] = video[of, step]
+        self._poses[row, written] = poses
         executed = (self.max_steps - now).clamp(max=length)  # at least 1: rows at max_steps are not active
         last = torch.arange(count, device=self.device), executed - 1
         self._kinematic[rows, 1], self._state[rows, 1] = kinematic[last], states[last]
         self._steps[rows] += executed
         self._decisions[rows] += 1
 
+        shown = [(frames_key(camera), video) for camera, video in frames.items()]
+        shown += [(image_key(camera), video[last]) for camera, video in frames.items()]
         for key, value in (
-            (FRAMES, frames),
+            *shown,
             (STATES, states),
             (KINEMATIC_STATES, kinematic),
             (STEP_MASK, offset <= executed.unsqueeze(-1)),
-            (IMAGE, frames[last]),
             (STATE, states[last]),
             (KINEMATIC_STATE, kinematic[last]),
             (NUM_STEPS, self._steps[rows].unsqueeze(-1)),
             (NOISE_SEED, seeds),
         ):
             out[key].flatten(0, 1)[rows] = value  # a view: written in place
+        for camera, video in frames.items():
+            self._image(camera)[rows] = video[last]
+
+    def _recall(self, row: Tensor, numbers: Tensor) -> TensorDict:
+        """Frames and poses [n, K] of rows [n, 1] by their numbers [n, K]."""
+        out = TensorDict({"poses": self._poses[row, numbers]}, batch_size=numbers.shape, device=self.device)
+        for camera in self.cameras:
+            out[frames_key(camera)] = self._kept(camera)[row, self._slot[numbers]]
+        return out
+
+    def _checked_frames(self, painted: TensorDictBase, camera: str, count: int) -> Tensor:
+        expected = (count, self.chunk_length, 3, self.image_size, self.image_size)
+        frames = painted.get(frames_key(camera), None)
+        if frames is None or tuple(frames.shape) != expected or frames.dtype != torch.uint8:
+            got = "nothing" if frames is None else f"{frames.dtype} {tuple(frames.shape)}"
+            raise ValueError(f"the world model must write {frames_key(camera)} as uint8 {expected}, got {got}")
+        return frames
 
     def _checked_chunk(self, tensordict: TensorDictBase) -> Tensor:
         """The actions [G * N, C, 7] of all rows."""
@@ -349,17 +328,13 @@ class ImaginedEnv(EnvBase):
         return chunk.detach().to(self.device, torch.float32).flatten(0, 1)
 
     def _noise_seeds(self, rows: Tensor) -> Tensor:
-        """Seeds int64 [n, 1] in [0, 2^62): hash of (seed, context, rollout, episode, decision), not of the row."""
         parts = (self._context[rows, 0], rows % self.batch_size[1], self._episode[rows], self._decisions[rows])
-        seed = torch.full_like(rows, self._seed)
-        for part in parts:
-            seed = _mix(seed ^ _mix(part + 1))
-        return (seed & (2**62 - 1)).unsqueeze(-1)
+        return noise_seeds(self._seed, *parts).unsqueeze(-1)
 
     def _observe(self) -> TensorDictBase:
         """The current observation of all rows, with an empty chunk: what a reset, or a row not stepped, shows."""
-        batch, chunk = self.batch_size, self.chunk_length
-        rows = torch.arange(len(self._steps), device=self.device)
+        batch, chunk, image = self.batch_size, self.chunk_length, (3, self.image_size, self.image_size)
+        images = {image_entry(name): self._image(name).clone().unflatten(0, batch) for name in self.cameras}
         if self._text_stack is None:
             self._text_stack = NonTensorStack(*self._text).reshape(batch)
 
@@ -368,15 +343,12 @@ class ImaginedEnv(EnvBase):
 
         out = TensorDict(
             {
-                "observation": {
-                    "image": self._video[rows, self._steps].unflatten(0, batch),
-                    "state": self._state[:, 1].clone().unflatten(0, batch),
-                },
+                "observation": images | {"state": self._state[:, 1].clone().unflatten(0, batch)},
                 KINEMATIC_STATE: self._kinematic[:, 1].clone().unflatten(0, batch),
                 TASK_ID: self._task.clone().unflatten(0, batch),
                 CONTEXT_ID: self._context.clone().unflatten(0, batch),
                 NUM_STEPS: self._steps.clone().view(*batch, 1),
-                FRAMES: empty(*self._video.shape[2:], dtype=torch.uint8),
+                FRAMES: {image_entry(name): empty(*image, dtype=torch.uint8) for name in self.cameras},
                 STATES: empty(STATE_DIM),
                 KINEMATIC_STATES: empty(KINEMATIC_DIM),
                 NOISE_SEED: torch.zeros(*batch, 1, dtype=torch.int64, device=self.device),
@@ -387,11 +359,3 @@ class ImaginedEnv(EnvBase):
         )
         out.set(INSTRUCTION, self._text_stack)
         return out
-
-
-def _mix(value: Tensor) -> Tensor:
-    """splitmix64 on int64 (wrapping): neighbouring integers become unrelated ones."""
-    value = value + -7046029254386353131
-    value = (value ^ ((value >> 30) & (2**34 - 1))) * -4658895280553007687
-    value = (value ^ ((value >> 27) & (2**37 - 1))) * -7723592293110705685
-    return value ^ ((value >> 31) & (2**33 - 1))

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
-from tensordict import TensorDictBase
+from tensordict import NonTensorStack, TensorDict, TensorDictBase, is_leaf_nontensor, is_non_tensor
 from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import Transform
 
 from worldenv_trl.keys import (
     FRAMES,
-    IMAGE,
+    INSTRUCTION,
     KINEMATIC_STATE,
     KINEMATIC_STATES,
     NUM_STEPS,
@@ -18,48 +20,62 @@ from worldenv_trl.keys import (
     STATES,
     STEP_MASK,
     SUCCESS_PROB,
-    TASK_ID,
+    frames_key,
+    image_key,
 )
-from worldenv_trl.reflectors import Reflector
+from worldenv_trl.language import instructions_of
+from worldenv_trl.reflectors import Reflector, StopRule
 
 __all__ = ["Reflect"]
 
 
 class Reflect(Transform):
-    """Scores every prefix of a rollout's video and ends the rollout at once when it says that the task is done.
+    """Scores every prefix of a rollout's video and ends the rollout at once when its rule says that the task is done.
 
-    Over :class:`ImaginedEnv` all frames of a chunk are scored in one batch; the first crossing ends the row *inside*
-    the chunk: ``step_mask`` is False behind it, and image, states and ``num_steps`` are those of the crossing frame.
-    Over a step-level :class:`TabletopEnv` each frame is scored as it comes (put :func:`chunked` around it, not inside).
+    Over :class:`ImaginedEnv` all frames of a chunk are scored in one batch; the rule ends the row *inside* the chunk:
+    ``step_mask`` is False behind it, and images, states and ``num_steps`` are those of the frame that ended it. Over a
+    step-level :class:`TabletopEnv` each frame is scored as it comes (put :func:`chunked` around it, not inside).
 
     ``reward`` is 0 until the rollout ends, for whatever reason, and then R(o_1:t, g) (World-Env section 3.3);
-    ``success_prob`` is the score of the last frame. The first frame, seen before anything was done, never stops a row.
+    ``success_prob`` is the score of the last frame.
 
     Args:
-        reflector: frozen; its features, not the frames, are kept along a rollout.
-        threshold: a frame crosses when its score is above (the paper's 0.5).
-        num_frames: most frames of a prefix that are looked at; default: the reflector's own.
-        consecutive: crossing frames in a row that end a rollout.
+        reflector: frozen; its state, not the frames, is kept along a rollout.
+        rule: when a score ends a rollout; may be assigned while the rollout runs.
+
+    Attributes:
+        stops: False while scores are written and nothing is ended by them; frames in a row are then not counted.
 
     Raises:
-        ValueError: for a threshold outside (0, 1), ``consecutive`` below 1 or ``num_frames`` below 2.
+        ValueError: when it is put onto an env that does not show what the reflector looks at; when a reflector's state
+            or scores are not of the videos that it was given.
     """
 
-    def __init__(
-        self, reflector: Reflector, threshold: float = 0.5, num_frames: int | None = None, consecutive: int = 1
-    ) -> None:
-        if not 0 < threshold < 1:
-            raise ValueError(f"threshold must be in (0, 1), got {threshold}")
-        if consecutive < 1:
-            raise ValueError(f"consecutive must be at least 1, got {consecutive}")
-        if num_frames is not None and num_frames < 2:
-            raise ValueError(f"num_frames must be at least 2, the first and the last frame, got {num_frames}")
-        super().__init__(in_keys=[IMAGE], out_keys=[SUCCESS_PROB])
+    def __init__(self, reflector: Reflector, rule: StopRule = StopRule()) -> None:  # noqa: B008 - frozen
+        super().__init__(in_keys=[*(image_key(camera) for camera in reflector.cameras), INSTRUCTION])
+        self.out_keys = [SUCCESS_PROB]
         self.reflector = reflector.eval().requires_grad_(False)
-        self.num_frames = num_frames
-        self.threshold, self.consecutive = float(threshold), int(consecutive)
-        # TorchRL steps chunks through shallow copies of this transform: all must remember the same rollouts.
-        self._memory: dict[str, Tensor] = {}
+        # TorchRL steps chunks through shallow copies of this transform: all must remember the same rollouts and rule.
+        self._memory: dict[str, Any] = {"rule": rule, "stops": True}
+
+    @property
+    def rule(self) -> StopRule:
+        return self._memory["rule"]
+
+    @rule.setter
+    def rule(self, rule: StopRule) -> None:
+        self._memory["rule"] = rule
+
+    @property
+    def stops(self) -> bool:
+        return self._memory["stops"]
+
+    @stops.setter
+    def stops(self, stops: bool) -> None:
+        self._memory["stops"] = bool(stops)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({type(self.reflector).__name__}, {self.rule}, stops={self.stops})"
 
     # ------------------------------------------------------------------------------------------------- reset
 
@@ -67,23 +83,22 @@ class Reflect(Transform):
     def _reset(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
         batch, memory = self.parent.batch_size, self._memory
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        image = tensordict_reset[IMAGE]
-        count = batch.numel()
-        if "features" not in memory or memory["features"].shape[0] != count:
-            memory["features"] = torch.zeros(count, 1, self.reflector.feature_dim, device=image.device)
-            memory["seen"] = torch.zeros(count, dtype=torch.int64, device=image.device)
-            memory["streak"] = torch.zeros_like(memory["seen"])
-            memory["prob"] = torch.zeros(count, device=image.device)
-        rows = torch.arange(count, device=image.device)
-        if mask is not None:
-            rows = rows[mask.reshape(-1)]
-        memory["features"][rows, 0] = self.reflector.encode(image.reshape(-1, *image.shape[-3:])[rows])
-        memory["seen"][rows], memory["streak"][rows] = 1, 0
-        task = tensordict_reset[TASK_ID].reshape(-1, 1)[rows]
-        first = self.reflector.prefix_scores(
-            memory["features"][rows, :1], torch.zeros_like(rows), 1, task, self.num_frames
-        )
-        memory["prob"][rows] = first[:, 0]
+        images = {camera: _by_row(tensordict_reset, image_key(camera)) for camera in self.reflector.cameras}
+        count, device = batch.numel(), next(iter(images.values())).device
+        if "prob" not in memory or len(memory["prob"]) != count:
+            mask = None  # rows without a video cannot be left out
+            memory["prob"] = torch.zeros(count, device=device)
+            memory["streak"] = torch.zeros(count, dtype=torch.int64, device=device)
+            memory["state"] = TensorDict(batch_size=[0])
+        rows = torch.arange(count, device=device)
+        rows = rows if mask is None else rows[mask.reshape(-1)]
+        if len(rows):
+            goals = instructions_of(tensordict_reset)
+            goals = [goals[row] for row in rows.tolist()]
+            state = self.reflector.begin({camera: shown[rows] for camera, shown in images.items()}, goals)
+            self._check("begin", "state['score']", tuple(state["score"].shape), (len(rows),))
+            memory["state"] = _merged(memory["state"], rows, state, count)
+            memory["prob"][rows], memory["streak"][rows] = state["score"].float(), 0
         tensordict_reset[SUCCESS_PROB] = memory["prob"].reshape(*batch, 1).clone()
         return tensordict_reset
 
@@ -91,30 +106,24 @@ class Reflect(Transform):
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        batch = self.parent.batch_size
-        active = tensordict.get("_step", None)
-        image = next_tensordict[IMAGE]
-        active = (
-            torch.ones(batch.numel(), dtype=torch.bool, device=image.device) if active is None else active.reshape(-1)
-        )
-        rows = active.nonzero().squeeze(-1)
+        shape = (*self.parent.batch_size, 1)
         ended = {name: next_tensordict[name].reshape(-1).clone() for name in ("terminated", "truncated")}
+        active = tensordict.get("_step", None)
+        active = torch.ones_like(ended["terminated"]) if active is None else active.reshape(-1)
         for name, value in ended.items():  # a row that is not stepped keeps its end, whoever decided it
             before = tensordict.get(name, None)
             if before is not None:
                 value[~active] = before.reshape(-1)[~active]
+        chunk = next_tensordict.get(frames_key(self.reflector.cameras[0]), None) is not None
+        executed = _by_row(next_tensordict, STEP_MASK) if chunk else torch.ones_like(active).unsqueeze(-1)  # [R, C]
+        rows = (active & executed.any(-1)).nonzero().squeeze(-1)
         if len(rows):
-            chunk = FRAMES in next_tensordict.keys()  # noqa: SIM118 - a TensorDict iterates over rows
-            frames = next_tensordict[FRAMES] if chunk else image.unsqueeze(-4)
-            frames = frames.reshape(batch.numel(), *frames.shape[-4:])[rows]  # [n, C, 3, H, W]
-            executed = self._executed(next_tensordict, rows, frames.shape[1], chunk)
-            stop, last = self._judge(rows, frames, executed, next_tensordict[TASK_ID].reshape(-1, 1)[rows])
+            stop, last = self._judge(rows, self._frames(next_tensordict, rows, chunk), executed[rows])
             ended["terminated"][rows] |= stop
             ended["truncated"][rows] &= ~stop
             if chunk:
-                self._cut(next_tensordict, rows, stop, last, executed)
+                self._cut(next_tensordict, rows[stop], last[stop], executed[rows[stop]])
         done = ended["terminated"] | ended["truncated"]
-        shape = (*batch, 1)
         for name, value in (*ended.items(), ("done", done)):
             next_tensordict[name] = value.reshape(shape)
         prob = self._memory["prob"].reshape(shape).clone()
@@ -122,58 +131,133 @@ class Reflect(Transform):
         next_tensordict["reward"] = torch.where(done.reshape(shape), prob, 0.0)
         return next_tensordict
 
-    def _executed(self, next_tensordict: TensorDictBase, rows: Tensor, count: int, chunk: bool) -> Tensor:
-        if not chunk:
-            return torch.ones(len(rows), 1, dtype=torch.bool, device=rows.device)
-        return next_tensordict[STEP_MASK].reshape(-1, count)[rows]
+    def _frames(self, shown: TensorDictBase, rows: Tensor, chunk: bool) -> dict[str, Tensor]:
+        """The new frames of ``rows``, uint8 [n, C, 3, H, W] by camera."""
+        frames = {}
+        for camera in self.reflector.cameras:
+            video = _by_row(shown, frames_key(camera)) if chunk else _by_row(shown, image_key(camera)).unsqueeze(1)
+            frames[camera] = video if len(rows) == len(video) else video[rows]
+        return frames
 
-    def _judge(self, rows: Tensor, frames: Tensor, executed: Tensor, task_id: Tensor) -> tuple[Tensor, Tensor]:
-        """Scores ``frames [n, C]``: whether each row stops ``[n]``, and the index of its last frame ``[n]``."""
-        count, memory = frames.shape[1], self._memory
-        features = self.reflector.encode(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
-        seen = memory["seen"][rows]
-        needed = int(seen.max()) + count
-        if memory["features"].shape[1] < needed:
-            spare = max(needed, 2 * memory["features"].shape[1]) - memory["features"].shape[1]
-            memory["features"] = torch.nn.functional.pad(memory["features"], (0, 0, 0, spare))
-        place = seen.unsqueeze(-1) + torch.arange(count, device=rows.device)
-        memory["features"][rows.unsqueeze(-1), place] = features
-        scores = self.reflector.prefix_scores(memory["features"][rows, :needed], seen, count, task_id, self.num_frames)
-        streak, crossed = memory["streak"][rows], []
-        for index in range(count):
-            streak = torch.where(
-                (scores[:, index] > self.threshold) & executed[:, index], streak + 1, torch.zeros_like(streak)
-            )
-            crossed.append(streak >= self.consecutive)
-        crossing = torch.stack(crossed, 1)
-        stop = crossing.any(1)
-        last = torch.where(stop, crossing.long().argmax(1), executed.sum(1) - 1)
+    def _judge(self, rows: Tensor, frames: dict[str, Tensor], executed: Tensor) -> tuple[Tensor, Tensor]:
+        """Whether each of the n rows stops, bool [n], and the index in the chunk of its last frame, int64 [n]."""
+        memory, whole = self._memory, len(self._memory["prob"])
+        # Frames behind a row's end are extended by, too: the row is not stepped again before its reset.
+        state, scores = self.reflector.extend(memory["state"] if len(rows) == whole else memory["state"][rows], frames)
+        self._check("extend", "scores", tuple(scores.shape), tuple(executed.shape))
+        scores = scores.float()
+        memory["state"] = _merged(memory["state"], rows, state, whole)
+        stop, last, streak = self.rule.extend(memory["streak"][rows], scores, executed)
+        if not self.stops:
+            stop, last, streak = torch.zeros_like(stop), executed.sum(1) - 1, torch.zeros_like(streak)
         memory["streak"][rows] = streak
-        memory["seen"][rows] = seen + last + 1
-        memory["prob"][rows] = scores[torch.arange(len(rows), device=rows.device), last]
+        memory["prob"][rows] = scores.gather(1, last.unsqueeze(-1)).squeeze(-1)
         return stop, last
 
-    def _cut(self, out: TensorDictBase, rows: Tensor, stop: Tensor, last: Tensor, executed: Tensor) -> None:
-        """Ends the stopped rows at their crossing frame."""
-        here, at = rows[stop], last[stop]
-        if not len(here):
+    def _cut(self, out: TensorDictBase, rows: Tensor, last: Tensor, executed: Tensor) -> None:
+        """Ends ``rows`` at frame ``last`` of their chunk."""
+        if not len(rows):
             return
-        batch = self.parent.batch_size
-        for whole, one in ((FRAMES, IMAGE), (STATES, STATE), (KINEMATIC_STATES, KINEMATIC_STATE)):
-            values = out[one].reshape(batch.numel(), *out[one].shape[len(batch) :]).clone()
-            values[here] = out[whole].reshape(batch.numel(), *out[whole].shape[len(batch) :])[here, at]
+        shown = set(out[FRAMES].keys())
+        images = [((FRAMES, name), ("observation", name)) for name in out["observation"].keys() if name in shown]  # noqa: SIM118
+        for whole, one in (*images, (STATES, STATE), (KINEMATIC_STATES, KINEMATIC_STATE)):
+            values = _by_row(out, one).clone()
+            values[rows] = _by_row(out, whole)[rows, last]
             out[one] = values.reshape(out[one].shape)
-        mask = out[STEP_MASK].reshape(batch.numel(), -1).clone()
-        kept = executed[stop] & (torch.arange(mask.shape[1], device=mask.device) <= at.unsqueeze(-1))
-        steps = out[NUM_STEPS].reshape(-1, 1).clone()
-        steps[here] -= executed[stop].sum(-1, keepdim=True) - kept.sum(-1, keepdim=True)
-        mask[here] = kept
+        mask, steps = _by_row(out, STEP_MASK).clone(), out[NUM_STEPS].reshape(-1, 1).clone()
+        kept = executed & (torch.arange(mask.shape[1], device=mask.device) <= last.unsqueeze(-1))
+        steps[rows] -= executed.sum(-1, keepdim=True) - kept.sum(-1, keepdim=True)
+        mask[rows] = kept
         out[STEP_MASK], out[NUM_STEPS] = mask.reshape(out[STEP_MASK].shape), steps.reshape(out[NUM_STEPS].shape)
+
+    def _check(self, call: str, name: str, got: tuple[int, ...], expected: tuple[int, ...]) -> None:
+        if got != expected:
+            raise ValueError(f"{type(self.reflector).__name__}.{call}: {name} must be {expected}, got {got}")
 
     # ------------------------------------------------------------------------------------------------- specs
 
+    def set_container(self, container: Any) -> None:
+        super().set_container(container)
+        parent = self.parent
+        if parent is not None:
+            try:
+                self._check_env(parent.observation_spec)
+            except ValueError:
+                self.reset_parent()  # it may be put onto another env
+                raise
+
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        self._check_env(observation_spec)
         observation_spec[SUCCESS_PROB] = Bounded(
             0.0, 1.0, shape=(*observation_spec.shape, 1), dtype=torch.float32, device=observation_spec.device
         )
         return observation_spec
+
+    def _check_env(self, spec: Composite) -> None:
+        """Raises ``ValueError`` unless the env shows every camera of the reflector, in its size."""
+        reflector, part = self.reflector, type(self.reflector).__name__
+        entries = set(spec.keys(True, True))
+        key_of = frames_key if STEP_MASK in entries else image_key
+        for camera in reflector.cameras:
+            if image_key(camera) not in entries:
+                images = sorted(name for name, entry in spec["observation"].items() if entry.dtype == torch.uint8)
+                raise ValueError(
+                    f"the reflector {part} looks at the camera {camera!r} ({image_key(camera)}), which the env does "
+                    f"not show (it shows {', '.join(images) or 'no image'}): pass cameras={reflector.cameras} to the "
+                    "env, or a reflector that is trained for the env's cameras"
+                )
+            if key_of(camera) not in entries:
+                raise ValueError(
+                    f"the env's steps are chunks without the frames {key_of(camera)}: put Reflect onto the step-level "
+                    "env and chunked() around it, and whatever leaves out frames behind Reflect"
+                )
+            size = tuple(spec[key_of(camera)].shape[-2:])
+            if reflector.image_size is not None and size != (reflector.image_size, reflector.image_size):
+                raise ValueError(
+                    f"the reflector {part} looks at frames of {reflector.image_size} px, the env's {key_of(camera)} "
+                    f"are {size[0]} x {size[1]} px: pass image_size={reflector.image_size} to the env, or a reflector "
+                    "that is trained for that size"
+                )
+
+
+def _by_row(tensordict: TensorDictBase, key: Any) -> Tensor:
+    """An entry [*B, ...] as [rows, ...]."""
+    value = tensordict[key]
+    return value.reshape(-1, *value.shape[tensordict.ndim :])
+
+
+def _merged(whole: TensorDictBase, rows: Tensor, part: TensorDictBase, count: int) -> TensorDictBase:
+    """``whole`` [count] with ``part`` [n] in its ``rows``, ascending; what is shorter along dim 1 is padded with zeros.
+
+    A ``whole`` of other rows is none yet: ``rows`` are then all.
+    """
+    if len(rows) == count:
+        return part
+    out = TensorDict(batch_size=[count], device=whole.device)
+    for key in part.keys(True, True, is_leaf=is_leaf_nontensor):
+        old, new = whole.get(key), part.get(key)
+        if isinstance(old, str) or is_non_tensor(old):
+            texts, changed = (_texts(value, n) for value, n in ((old, count), (new, len(rows))))
+            for row, text in zip(rows.tolist(), changed, strict=True):
+                texts[row] = text
+            out.set(key, NonTensorStack(*texts))
+            continue
+        if old.ndim > 1:
+            length = max(old.shape[1], new.shape[1])
+            old, new = _padded(old, length), _padded(new, length)
+        old = old.clone()
+        old[rows] = new
+        out.set(key, old)
+    return out
+
+
+def _texts(value: Any, count: int) -> list[Any]:
+    return [value] * count if isinstance(value, str) else list(value.tolist())
+
+
+def _padded(values: Tensor, length: int) -> Tensor:
+    if values.shape[1] == length:
+        return values
+    wider = values.new_zeros(values.shape[0], length, *values.shape[2:])
+    wider[:, : values.shape[1]] = values
+    return wider

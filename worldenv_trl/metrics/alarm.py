@@ -92,8 +92,7 @@ class HonestyAlarm:
 
 def _sign_flip_test(differences: Tensor) -> float:
     """Probability that whole numbers ``[K]`` with fair coins for signs sum to what they do, or to more."""
-    sizes = differences.abs()
-    sizes = sizes[sizes > 0].tolist()
+    sizes = differences[differences != 0].abs().tolist()
     reach = sum(sizes)
     chances = torch.zeros(2 * reach + 1, dtype=torch.float64)  # of each sum, from -reach to reach
     chances[reach] = 1.0

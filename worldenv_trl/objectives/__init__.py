@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from worldenv_trl.objectives.diffusion import DiffusionLoss
 from worldenv_trl.objectives.loop import LOOPLoss
 from worldenv_trl.objectives.reflector import ReflectorLoss
 from worldenv_trl.objectives.rloo import rloo_advantage
+from worldenv_trl.objectives.world_model import WorldModelLoss
 
-__all__ = ["DiffusionLoss", "LOOPLoss", "ReflectorLoss", "rloo_advantage"]
+__all__ = ["LOOPLoss", "ReflectorLoss", "WorldModelLoss", "rloo_advantage"]

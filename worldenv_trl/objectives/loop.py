@@ -60,12 +60,35 @@ class LOOPLoss(LossModule):
         ValueError: for a setting out of range, or entries whose shapes do not match.
 
     Examples:
-        >>> loss = LOOPLoss(actor, clip_epsilon=0.1)
-        >>> batch["advantage"] = rloo_advantage(batch["returns"][..., 0])[..., None, None].expand(*batch.shape, 1)
+        >>> import torch
+        >>> from torchrl.envs.utils import ExplorationType, set_exploration_type
+        >>> from worldenv_trl.objectives import rloo_advantage
+        >>> from worldenv_trl.policies import OFTConfig, OFTPolicy, laplace_actor, scale_bounds
+        >>> policy = OFTPolicy(OFTConfig(instructions=("open the drawer",)))
+        >>> groups = policy.post_training_parameters(rank=4)
+        >>> actor = laplace_actor(policy, log_scale_bounds=scale_bounds(policy))
+
+        What a :class:`~worldenv_trl.collectors.GroupCollector` yields, made up: 2 groups, 3 rollouts, 2 decisions.
+
+        >>> shape = (2, 3, 2)
+        >>> observation = {"image": torch.zeros(*shape, 3, 64, 64, dtype=torch.uint8), "state": torch.zeros(*shape, 7)}
+        >>> batch = TensorDict({"observation": observation, "language_instruction": "open the drawer"}, shape)
+        >>> with set_exploration_type(ExplorationType.RANDOM), torch.no_grad():
+        ...     batch = actor(batch)
+        >>> batch["next", "step_mask"] = torch.ones(*shape, 8, dtype=torch.bool)
+        >>> batch["collector", "mask"] = torch.ones(shape, dtype=torch.bool)
+        >>> batch["returns"] = torch.rand(2, 3, 1).expand(shape)
+
+        An update:
+
+        >>> loss = LOOPLoss(actor, clip_epsilon=0.1, functional=False)
+        >>> batch["advantage"] = rloo_advantage(batch["returns"][..., 0])[..., None, None].expand(*shape, 1)
         >>> decisions = batch[batch["collector", "mask"]]  # [M]
         >>> decisions["total_steps"] = decisions["next", "step_mask"].sum().expand(len(decisions), 1)
-        >>> for minibatch in decisions.split(64):  # the gradients add up to that of loss(decisions)
+        >>> for minibatch in decisions.split(4):  # the gradients add up to that of loss(decisions)
         ...     loss(minibatch)["loss_objective"].backward()
+        >>> all(parameter.grad is not None for group in groups.values() for parameter in group)
+        True
     """
 
     @dataclass
@@ -191,7 +214,7 @@ class LOOPLoss(LossModule):
         return self._log_ratio(now - before, steps, advantage)
 
     def _distribution(self, tensordict: TensorDictBase) -> Distribution:
-        if self.functional:
+        if self.actor_network_params is not None:
             with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
                 return self.actor_network.get_dist(tensordict)
         return self.actor_network.get_dist(tensordict)

@@ -1,66 +1,46 @@
-"""Binary cross-entropy of the reflector (World-Env section 3.3)."""
+"""What a reflector learns from, as a TorchRL loss (World-Env section 3.3)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
-import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch
-from tensordict.utils import NestedKey
 from torchrl.objectives.common import LossModule
 
-from worldenv_trl import keys
 from worldenv_trl.reflectors import Reflector
 
 __all__ = ["ReflectorLoss"]
 
 
 class ReflectorLoss(LossModule):
-    """BCE of R(o_1:t, g) against whether the goal holds at frame t.
+    """The reflector's own loss of a batch that one of its lessons drew, whatever it reads.
 
-    Reads ``features`` [P, L, F] of sampled prefixes, ``lengths`` int64 [P, 1], ``task_id`` [P, 1] and ``label`` bool
-    [P, 1]. Returns ``loss_reflector`` (scalar) and the detached ``accuracy`` at 0.5.
+    Returns ``loss_reflector`` (scalar) and the detached ``accuracy`` at 0.5.
 
     Args:
-        reflector: its reward head is trained in place; the encoder is not touched.
+        reflector: trained in place.
 
-    Keyword Args:
-        label_smoothing: labels become ``s / 2`` and ``1 - s / 2``.
+    Raises:
+        TypeError: when called, for a reflector that has no lessons.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from worldenv_trl.reflectors import CompactReflector, CompactReflectorConfig
+        >>> loss = ReflectorLoss(CompactReflector(CompactReflectorConfig(("open the drawer",))))
+        >>> batch = TensorDict({"words": torch.tensor([[4, 2, 3]] * 5), "label": torch.ones(5, 1, dtype=torch.bool),
+        ...                     "features": torch.randn(5, 6, 96), "lengths": torch.full((5, 1), 6)}, batch_size=[5])
+        >>> sorted(loss(batch).keys())
+        ['accuracy', 'loss_reflector']
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        features: NestedKey = "features"
-        lengths: NestedKey = "lengths"
-        label: NestedKey = "label"
-
-    default_keys = _AcceptedKeys
     reflector: Reflector
+    in_keys: ClassVar[list[str]] = []
     out_keys: ClassVar[list[str]] = ["loss_reflector", "accuracy"]
 
-    def __init__(self, reflector: Reflector, *, label_smoothing: float = 0.0) -> None:
+    def __init__(self, reflector: Reflector) -> None:
         super().__init__()
-        if not 0 <= label_smoothing < 1:
-            raise ValueError(f"label_smoothing must be in [0, 1), got {label_smoothing}")
-        self.reflector, self.label_smoothing = reflector, float(label_smoothing)
-        self._forward_value_estimator_keys()
+        self.reflector = reflector
 
-    def _forward_value_estimator_keys(self, **_: object) -> None:
-        names = self.tensor_keys
-        self.in_keys = [names.features, names.lengths, keys.TASK_ID, names.label]
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        names = self.tensor_keys
-        logits = self.reflector.logits(
-            tensordict[names.features], tensordict[names.lengths].squeeze(-1), tensordict[keys.TASK_ID]
-        )
-        label = tensordict[names.label].squeeze(-1)
-        target = label.float() * (1 - self.label_smoothing) + self.label_smoothing / 2
-        loss = F.binary_cross_entropy_with_logits(logits, target)
-        with torch.no_grad():
-            accuracy = ((logits > 0) == label).float().mean()
-        return TensorDict({"loss_reflector": loss, "accuracy": accuracy})
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        return self.reflector.training_loss(tensordict).select(*self.out_keys)

@@ -18,6 +18,7 @@ def rloo_advantage(returns: Tensor) -> Tensor:
         ValueError: if a group has fewer than two rollouts.
 
     Examples:
+        >>> import torch
         >>> rloo_advantage(torch.tensor([1.0, 0.0, 0.5]))
         tensor([ 0.7500, -0.7500,  0.0000])
     """

@@ -1,16 +1,21 @@
-"""Policies: Laplace distribution and actor, the compact OFT policy, image augmentation."""
+"""Policies: the interface, the Laplace distribution and actor, the compact OFT policy, image augmentation."""
 
-from worldenv_trl.policies.actor import LaplaceActor, laplace_actor, likelihood_actor
+from worldenv_trl.policies.actor import LaplaceActor, laplace_actor, likelihood_actor, scale_bounds
 from worldenv_trl.policies.augmentation import random_shift
+from worldenv_trl.policies.base import Policy
 from worldenv_trl.policies.laplace import IndependentLaplace
 from worldenv_trl.policies.oft import OFTConfig, OFTPolicy
+from worldenv_trl.policies.pairing import check_pairing
 
 __all__ = [
     "IndependentLaplace",
     "LaplaceActor",
     "OFTConfig",
     "OFTPolicy",
+    "Policy",
+    "check_pairing",
     "laplace_actor",
     "likelihood_actor",
     "random_shift",
+    "scale_bounds",
 ]

@@ -6,54 +6,102 @@ import math
 from collections.abc import Sequence
 
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor
 
-from worldenv_trl.keys import CHUNK, IMAGE, LOC, LOG_PROBS, LOG_SCALE, SCALE, STATE, TASK_ID
+from worldenv_trl.keys import CHUNK, LOC, LOG_PROBS, LOG_SCALE, SCALE
+from worldenv_trl.policies.base import Policy
 from worldenv_trl.policies.laplace import IndependentLaplace
+
+__all__ = ["LaplaceActor", "laplace_actor", "likelihood_actor", "scale_bounds"]
 
 Bound = float | Sequence[float]
 
 
-class _LaplaceParameters(nn.Module):
-    def __init__(self, policy: nn.Module, scale_factor: float, log_scale_bounds: tuple[Bound, Bound] | None):
+class _Scale(nn.Module):
+    """From what a policy writes to what is sampled from: ``scale = exp(clamp(log_scale)) * scale_factor``."""
+
+    log_scale_low: Tensor | None
+    log_scale_high: Tensor | None
+    scale_factor: Tensor
+
+    def __init__(self, scale_factor: float, log_scale_bounds: tuple[Tensor, Tensor] | None) -> None:
         super().__init__()
-        self.policy = policy
-        low, high = (None, None) if log_scale_bounds is None else map(torch.as_tensor, log_scale_bounds)
+        low, high = (None, None) if log_scale_bounds is None else log_scale_bounds
         self.register_buffer("log_scale_low", low, persistent=False)
         self.register_buffer("log_scale_high", high, persistent=False)
         # A buffer: losses that hold a functional copy of this module share it and follow in-place changes.
-        self.register_buffer("scale_factor", torch.tensor(float(scale_factor)), persistent=False)
+        self.register_buffer("scale_factor", torch.tensor(scale_factor), persistent=False)
 
-    def forward(
-        self, image: torch.Tensor, state: torch.Tensor, task_id: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        loc, log_scale = self.policy(image, state, task_id)
+    def forward(self, loc: Tensor, log_scale: Tensor) -> tuple[Tensor, Tensor]:
         bounded = log_scale if self.log_scale_low is None else log_scale.clamp(self.log_scale_low, self.log_scale_high)
-        return loc, log_scale, bounded.exp() * self.scale_factor
+        return loc, bounded.exp() * self.scale_factor
 
 
 class LaplaceActor(ProbabilisticActor):
     """``ProbabilisticActor`` over action chunks; the density it samples from is the density it scores."""
 
     @property
-    def policy(self) -> nn.Module:
-        return self.module[0].module.policy
+    def policy(self) -> Policy:
+        return self.module[0][0]
 
     @property
     def scale_factor(self) -> float:
         """What the learned scale is multiplied with, for sampling and for scoring alike."""
-        return self.module[0].module.scale_factor.item()
+        return self._scale.scale_factor.item()
 
     def set_scale_factor(self, scale_factor: float) -> None:
         """Changes the exploration width in place, also for losses already built on this actor."""
-        self.module[0].module.scale_factor.fill_(_positive(scale_factor))
+        self._scale.scale_factor.fill_(_positive(scale_factor))
+
+    @property
+    def _scale(self) -> _Scale:
+        return self.module[0][1].module
+
+
+def scale_bounds(
+    policy: Policy, floor: tuple[float, float, float] = (0.04, 0.0025, 0.15), share: float = 0.125
+) -> tuple[list[float], float]:
+    """Bounds of the log-scale within which a policy explores, for :func:`laplace_actor`.
+
+    A scale that was learned on a few demonstrations tells what is left of the error there, a tenth of what it is on new
+    scenes: the rollouts of a group then end alike and LOOP learns nothing. So the scale of a dimension is no less than
+    ``floor``, and no less than ``share`` of the range that the training uses of it: where the demonstrations turn the
+    hand, noise that suits rotations they never use is so small that the smallest update goes too far.
+
+    Args:
+        policy: whose :attr:`~worldenv_trl.policies.Policy.action_range` counts.
+        floor: of the scale of position, rotation and gripper, in normalised action units.
+        share: of the policy's action range, from 0 (the floor alone) to 1.
+
+    Returns:
+        The lower bound of each of the 7 dimensions, and one upper bound (-1.5, and above every lower one).
+
+    Raises:
+        ValueError: for a floor that is not positive, or a share outside [0, 1].
+
+    Examples:
+        >>> from worldenv_trl.policies import OFTConfig, OFTPolicy
+        >>> policy = OFTPolicy(OFTConfig(instructions=("open the drawer",)))
+        >>> low, high = scale_bounds(policy, floor=(0.04, 0.0025, 0.15), share=0.0)
+        >>> [round(math.exp(bound), 4) for bound in low]
+        [0.04, 0.04, 0.04, 0.0025, 0.0025, 0.0025, 0.15]
+        >>> actor = laplace_actor(policy, log_scale_bounds=(low, high))
+    """
+    if not all(math.isfinite(value) and value > 0 for value in floor):
+        raise ValueError(f"floor must be positive, got {floor}")
+    if not 0 <= share <= 1:
+        raise ValueError(f"share must lie between 0 and 1, got {share}")
+    position, rotation, gripper = floor
+    floors = torch.tensor([*3 * [position], *3 * [rotation], gripper])
+    low = torch.maximum(floors, share * policy.action_range.cpu()).log().tolist()
+    return low, max(-1.5, *(bound + 1 for bound in low))
 
 
 def laplace_actor(
-    policy: nn.Module,
+    policy: Policy,
     *,
     event_dims: int = 1,
     scale_factor: float = 1.0,
@@ -61,34 +109,49 @@ def laplace_actor(
     loc_key: NestedKey = LOC,
     scale_key: NestedKey = SCALE,
 ) -> LaplaceActor:
-    """Wraps a policy ``(image, state, task_id) -> (loc, log_scale)``.
+    """Wraps a policy: ``TensorDictSequential(policy, scale)`` inside TorchRL's ``ProbabilisticActor``.
 
-    Reads ``IMAGE``, ``STATE`` and ``TASK_ID``; writes ``LOC``, ``LOG_SCALE``, ``SCALE = exp(clamp(log_scale)) *
-    scale_factor``, ``CHUNK`` (the mode under ``ExplorationType.DETERMINISTIC``) and ``LOG_PROBS`` (``[*B, C]`` for
-    ``event_dims=1``). The clamp and the factor are part of the density: behaviour and scored log-probabilities agree.
+    Reads what the policy reads; writes ``LOC``, ``LOG_SCALE``, ``SCALE = exp(clamp(log_scale)) * scale_factor``,
+    ``CHUNK`` (the mode under ``ExplorationType.DETERMINISTIC``) and ``LOG_PROBS`` ([*B, C] for ``event_dims=1``). The
+    clamp and the factor are part of the density: behaviour and scored log-probabilities agree.
 
     Args:
-        policy: for example :class:`~worldenv_trl.policies.OFTPolicy`.
+        policy: a :class:`~worldenv_trl.policies.Policy`.
         event_dims: trailing dimensions of ``[*B, C, 7]`` summed in the log-probability.
         scale_factor: exploration width relative to the trained scale, positive.
         log_scale_bounds: where the log-scale is clamped: (low, high), each one number or one for each action
-            dimension, or None. Its gradient is zero outside. A scale head that has learned the residuals on a few
-            demonstrations is far too sure of itself (a tenth of the error on new scenes): the lower bound is what
-            exploration lives on.
+            dimension, or None. Its gradient is zero outside. The lower bound is what exploration lives on: see
+            :func:`scale_bounds`.
         loc_key, scale_key: ``BCLoss`` takes the negative log-likelihood only of actors that write keys named plainly
             ``"loc"`` or ``"scale"`` (it falls back to squared errors of the mode, silently): for the scale-head stage
             use :func:`likelihood_actor`.
+
+    Raises:
+        TypeError: for what is not a policy.
+        ValueError: for bounds of which the lower one is not below the upper one, or a factor that is not positive.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from worldenv_trl.policies import OFTConfig, OFTPolicy
+        >>> policy = OFTPolicy(OFTConfig(instructions=("open the drawer",)))
+        >>> actor = laplace_actor(policy, log_scale_bounds=scale_bounds(policy))
+        >>> observation = {"image": torch.zeros(5, 3, 64, 64, dtype=torch.uint8), "state": torch.zeros(5, 7)}
+        >>> out = actor(TensorDict({"observation": observation, "language_instruction": "open the drawer"}, [5]))
+        >>> out["vla_action", "chunk"].shape, out["vla_action", "log_probs"].shape
+        (torch.Size([5, 8, 7]), torch.Size([5, 8]))
     """
+    if not isinstance(policy, Policy):
+        raise TypeError(f"policy must be a worldenv_trl.policies.Policy, got {type(policy).__name__}")
     scale_factor = _positive(scale_factor)
+    bounds = None
     if log_scale_bounds is not None:
         low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in log_scale_bounds)
         if not (low < high).all():
             raise ValueError(f"log_scale_bounds must be (low, high) with low < high, got {log_scale_bounds}")
-        log_scale_bounds = (low, high)
-    module = TensorDictModule(
-        _LaplaceParameters(policy, scale_factor, log_scale_bounds),
-        in_keys=[IMAGE, STATE, TASK_ID],
-        out_keys=[loc_key, LOG_SCALE, scale_key],
+        bounds = (low, high)
+    scale = _Scale(scale_factor, bounds).to(policy.action_range.device)
+    module = TensorDictSequential(
+        policy, TensorDictModule(scale, in_keys=[LOC, LOG_SCALE], out_keys=[loc_key, scale_key])
     )
     return LaplaceActor(
         module,
@@ -101,11 +164,17 @@ def laplace_actor(
     )
 
 
-def likelihood_actor(policy: nn.Module) -> LaplaceActor:
+def likelihood_actor(policy: Policy) -> LaplaceActor:
     """The same density without clamp, under key names for which ``BCLoss`` computes the Laplace NLL (World-Env Eq. 8).
 
     ``BCLoss(likelihood_actor(policy))`` with ``set_keys(action=CHUNK, pad_mask=ACTION_IS_PAD)`` is the mean over
     unpadded steps of ``sum_d |a_d - mu_d| / exp(beta_d) + beta_d + log 2``.
+
+    Examples:
+        >>> from worldenv_trl.policies import OFTConfig, OFTPolicy
+        >>> actor = likelihood_actor(OFTPolicy(OFTConfig(instructions=("open the drawer",))))
+        >>> {"loc", "scale"} <= set(actor.out_keys)
+        True
     """
     return laplace_actor(policy, log_scale_bounds=None, loc_key="loc", scale_key="scale")
 

@@ -15,6 +15,13 @@ def random_shift(images: torch.Tensor, pixels: int = 2, generator: torch.Generat
 
     Returns:
         A new tensor of the same shape and dtype.
+
+    Raises:
+        ValueError: for a shift below 0, or one that leaves the image.
+
+    Examples:
+        >>> random_shift(torch.zeros(2, 8, 3, 64, 64, dtype=torch.uint8), pixels=2).shape
+        torch.Size([2, 8, 3, 64, 64])
     """
     if pixels < 0 or pixels >= min(images.shape[-2:]):
         raise ValueError(f"pixels must be in [0, {min(images.shape[-2:]) - 1}], got {pixels}")

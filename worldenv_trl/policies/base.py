@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
 from worldenv_trl.keys import ACTION_DIM, INSTRUCTION, LOC, LOG_SCALE, STATE, STATE_DIM, image_key
@@ -24,20 +24,27 @@ class Policy(TensorDictModuleBase, abc.ABC):
     and ``("vla_action", "log_scale")``, float32 [*B, C, 7] in the env's normalised action units.
 
     A subclass calls ``super().__init__`` with what it is trained for, and implements :meth:`predict`,
-    :meth:`fit_statistics`, :attr:`action_range`, :meth:`scale_parameters` and :meth:`post_training_parameters`. With
-    :class:`~worldenv_trl.pretrained.Pretrained` beside it, all of that is saved with its weights.
+    :meth:`fit_statistics`, :meth:`scale_parameters` and :meth:`post_training_parameters`. With
+    :class:`~worldenv_trl.pretrained.Pretrained` beside it and the settings in its config, all of that is saved with its
+    weights, and :func:`~worldenv_trl.policies.check_pairing` holds an env against it.
 
     Keyword Args:
         cameras: scene cameras whose images it reads, in order.
         image_size: height and width of the images (px).
         chunk_length: C.
         proprio: what the state tells, ``commanded`` (the controller's targets) or ``measured``.
-        instructions: those it is trained on; others are answered with a warning.
+        instructions: those it is trained on; others are answered with a warning. Empty: it never warns.
+
+    Attributes:
+        action_range: half the range that the training uses of each action dimension, [7], in normalised units; a buffer
+            that is 1 until :meth:`fit_statistics` sets it.
 
     Raises:
-        ValueError: for no camera, one that is named twice, or another kind of proprioception; when called, for images
-            or states of another size.
+        ValueError: for no camera, one that is named twice, a size below 1, or another kind of proprioception; when
+            called, for an image that is missing, and images or states of another size.
     """
+
+    action_range: Tensor
 
     def __init__(
         self,
@@ -51,18 +58,21 @@ class Policy(TensorDictModuleBase, abc.ABC):
         super().__init__()
         if not cameras or len(set(cameras)) < len(cameras):
             raise ValueError(f"cameras must name at least one camera, each once, got {tuple(cameras)}")
+        if min(image_size, chunk_length) < 1:
+            raise ValueError(f"image_size and chunk_length must be at least 1, got {image_size} and {chunk_length}")
         if proprio not in ("commanded", "measured"):
             raise ValueError(f"proprio must be 'commanded' or 'measured', got {proprio!r}")
         self.cameras, self.image_size = tuple(cameras), int(image_size)
         self.chunk_length, self.proprio = int(chunk_length), proprio
-        self._seen = SeenInstructions(f"the policy {type(self).__name__}", instructions)
+        self.seen = SeenInstructions(f"the policy {type(self).__name__}", instructions)
+        self.register_buffer("action_range", torch.ones(ACTION_DIM))
         self.in_keys = [*(image_key(camera) for camera in self.cameras), STATE, INSTRUCTION]
         self.out_keys = [LOC, LOG_SCALE]
 
     @property
     def instructions(self) -> tuple[str, ...]:
         """What it was trained on."""
-        return self._seen.instructions
+        return self.seen.instructions
 
     @abc.abstractmethod
     def predict(
@@ -76,50 +86,60 @@ class Policy(TensorDictModuleBase, abc.ABC):
             instructions: n texts.
         """
 
-    @property
-    @abc.abstractmethod
-    def action_range(self) -> Tensor:
-        """Half the range that the training uses of each action dimension, [7], in normalised units."""
-
     @abc.abstractmethod
     def fit_statistics(self, states: Tensor, actions: Tensor) -> None:
-        """Takes what normalisation needs from training data, [..., 7] each."""
+        """Takes :attr:`action_range`, and what normalisation needs, from training data, [..., 7] each."""
 
     @abc.abstractmethod
     def scale_parameters(self) -> Iterable[nn.Parameter]:
-        """Parameters of the scale alone, for the stage that trains nothing else (World-Env Eq. 8)."""
+        """Parameters of the scale alone, for the stage that trains nothing else (World-Env Eq. 8).
+
+        ``loc`` does not depend on them, so a loss on ``loc`` leaves them without a gradient.
+        """
 
     @abc.abstractmethod
     def post_training_parameters(self, rank: int) -> dict[str, list[nn.Parameter]]:
         """Prepares for LOOP and returns the groups that it updates, ``adapters`` and ``heads``; the rest is frozen.
 
-        Adapters of that rank are added where there are none yet, without changing what the policy does. Build losses
-        and optimisers after this call.
+        Adapters of that rank are added where there are none yet, without changing what the policy does; again with the
+        same rank, it returns the same groups. ``adapters`` is empty for a policy that has none. Build losses and
+        optimisers after this call.
+
+        Raises:
+            ValueError: if there are adapters of another rank.
         """
 
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        batch = tensordict.batch_size
-        images = {camera: self._image(tensordict, camera) for camera in self.cameras}
         state = tensordict[STATE]
-        if state.shape != (*batch, STATE_DIM):
-            raise ValueError(f"{STATE} must be {[*batch, STATE_DIM]}, got {list(state.shape)}")
-        instructions = instructions_of(tensordict)
-        self._seen.check(instructions)
+        batch = state.shape[:-1]  # dispatched entries come without a batch size
+        if state.shape[-1] != STATE_DIM:
+            raise ValueError(f"{STATE} must be [*B, {STATE_DIM}], got {list(state.shape)}")
+        images = {camera: self._image(tensordict, camera, batch) for camera in self.cameras}
+        instructions = self._goals(tensordict, batch.numel())
         loc, log_scale = self.predict(images, state.reshape(-1, STATE_DIM), instructions)
         shape = (*batch, self.chunk_length, ACTION_DIM)
         tensordict.set(LOC, loc.float().reshape(shape))
         return tensordict.set(LOG_SCALE, log_scale.float().reshape(shape))
 
-    def _image(self, tensordict: TensorDictBase, camera: str) -> Tensor:
-        image, size = tensordict.get(image_key(camera), None), (3, self.image_size, self.image_size)
+    @torch.compiler.disable  # texts are no tensors: a compiled graph would be made anew for each mixture of them
+    def _goals(self, tensordict: TensorDictBase, rows: int) -> list[str]:
+        instructions = instructions_of(tensordict)
+        if len(instructions) == 1:
+            instructions = instructions * rows
+        if len(instructions) != rows:
+            raise ValueError(f"{INSTRUCTION} must be one text, or one for each of {rows} rows, got {len(instructions)}")
+        self.seen.check(instructions)
+        return instructions
+
+    def _image(self, tensordict: TensorDictBase, camera: str, batch: torch.Size) -> Tensor:
+        key, size = image_key(camera), (3, self.image_size, self.image_size)
+        image = tensordict.get(key, None)
         if image is None:
             raise ValueError(
-                f"this policy was trained for the cameras {', '.join(self.cameras)}; the tensordict has no "
-                f"{image_key(camera)} of {camera!r}: pass cameras={self.cameras} to the env"
+                f"this policy was trained for the cameras {', '.join(self.cameras)}; the tensordict has no {key} of "
+                f"{camera!r}: pass cameras={self.cameras} to the env"
             )
-        if image.dtype != torch.uint8 or tuple(image.shape[-3:]) != size:
-            raise ValueError(
-                f"{image_key(camera)} must be uint8 [*B, 3, {size[1]}, {size[2]}], "
-                f"got {image.dtype} {list(image.shape)}"
-            )
+        if image.dtype != torch.uint8 or tuple(image.shape) != (*batch, *size):
+            raise ValueError(f"{key} must be uint8 {[*batch, *size]}, got {image.dtype} {list(image.shape)}")
         return image.reshape(-1, *size)

@@ -17,6 +17,11 @@ class IndependentLaplace(Independent):
         loc: mean, median and mode, in normalised action units.
         scale: mean absolute deviation, positive, broadcastable to ``loc``.
         event_dims: number of trailing dimensions that are summed in ``log_prob`` and ``entropy``.
+
+    Examples:
+        >>> distribution = IndependentLaplace(torch.zeros(5, 8, 7), torch.full((7,), 0.1))
+        >>> distribution.log_prob(distribution.sample()).shape
+        torch.Size([5, 8])
     """
 
     def __init__(

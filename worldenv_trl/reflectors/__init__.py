@@ -1,6 +1,15 @@
 """Reward models that judge from video when a task is done."""
 
-from worldenv_trl.reflectors.base import Reflector, prefix_indices
-from worldenv_trl.reflectors.compact import CompactReflector, CompactReflectorConfig, blurred
+from worldenv_trl.reflectors.base import Lesson, Reflector
+from worldenv_trl.reflectors.compact import CompactReflector, CompactReflectorConfig
+from worldenv_trl.reflectors.compact_lessons import CompactLessons
+from worldenv_trl.reflectors.stop_rule import StopRule
 
-__all__ = ["CompactReflector", "CompactReflectorConfig", "Reflector", "blurred", "prefix_indices"]
+__all__ = [
+    "CompactLessons",
+    "CompactReflector",
+    "CompactReflectorConfig",
+    "Lesson",
+    "Reflector",
+    "StopRule",
+]

@@ -20,7 +20,12 @@ __all__ = ["Lesson", "Reflector"]
 
 @dataclass(frozen=True)
 class Lesson:
-    """One stage of a reflector's training: what is updated, on what, and for how long."""
+    """One stage of a reflector's training: what is updated, on what, and for how long.
+
+    The loop is the caller's, so that it can be interrupted and continued. It draws ``steps`` batches, one a step, from
+    torch's global generator alone, and updates ``parameters`` by AdamW; the learning rate rises to ``lr`` and falls
+    again (:class:`torch.optim.lr_scheduler.OneCycleLR` over ``steps``).
+    """
 
     name: str
     parameters: list[nn.Parameter]
@@ -35,12 +40,34 @@ class Reflector(nn.Module, abc.ABC):
     """Judges videos as they grow.
 
     A subclass calls ``super().__init__`` with what it is trained for, and implements :meth:`begin` and :meth:`extend`;
-    one that learns also :meth:`train_on` and :meth:`training_loss`.
+    one that learns also :meth:`train_on` and :meth:`training_loss`. With :class:`~worldenv_trl.pretrained.Pretrained`
+    beside it, it is saved and loaded like every part. It keeps nothing between calls: what it remembers of the videos
+    is in the state, so that rows can be taken out and put back in any number.
 
     Keyword Args:
         cameras: scene cameras whose frames it looks at.
         image_size: height and width of the frames (px), None for any.
         instructions: those it is trained on; others are answered with a warning.
+
+    Raises:
+        ValueError: for no camera, or one that is named twice.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> class Brightness(Reflector):
+        ...     def begin(self, frames, instructions):
+        ...         score = frames["agentview"].float().mean((-3, -2, -1)) / 255
+        ...         return TensorDict({"score": score}, batch_size=[len(score)])
+        ...     def extend(self, state, frames):
+        ...         scores = frames["agentview"].float().mean((-3, -2, -1)) / 255
+        ...         return state.copy().set("score", scores[:, -1]), scores
+        >>> reflector = Brightness()
+        >>> state = reflector.begin({"agentview": torch.zeros(2, 3, 16, 16, dtype=torch.uint8)}, ["shine", "glow"])
+        >>> bright = torch.full((2, 8, 3, 16, 16), 255, dtype=torch.uint8)
+        >>> state, scores = reflector.extend(state, {"agentview": bright})
+        >>> scores.shape, state["score"]
+        (torch.Size([2, 8]), tensor([1., 1.]))
     """
 
     def __init__(
@@ -70,18 +97,24 @@ class Reflector(nn.Module, abc.ABC):
             instructions: n texts.
 
         Returns:
-            TensorDict [n]: ``score`` float32 [n], R of the first frame, and whatever else the reflector keeps (features,
-            not frames). Entries may grow along their second dimension from call to call, padded with zeros.
+            TensorDict [n]: ``score`` float32 [n], R of the first frame, and whatever else the reflector keeps: tensors
+            (features, not frames) and texts. Tensors may grow along their second dimension from call to call; rows that
+            are shorter than others are padded with zeros.
         """
 
     @abc.abstractmethod
     def extend(self, state: TensorDictBase, frames: Mapping[str, Tensor]) -> tuple[TensorDict, Tensor]:
-        """The state after the next C frames, uint8 [n, C, 3, H, W] by camera, and R after each of them, [n, C]."""
+        """The state after the next C frames, uint8 [n, C, 3, H, W] by camera, and R after each of them, [n, C].
+
+        The scores of a video are the same in whatever pieces its frames come. ``state`` itself is not changed; the new
+        one has the same entries.
+        """
 
     def train_on(self, episodes: Episodes) -> Iterator[Lesson]:
         """The lessons to train on labelled ``episodes``, one after the other; none for a reflector that is not trained.
 
-        A lesson is asked for when the one before is over, so that it may build on what was learned.
+        A lesson is asked for when the one before is over, so that it may build on what was learned. A training that is
+        continued loads the weights, asks for the lessons that are over and leaves them out.
         """
         return iter(())
 

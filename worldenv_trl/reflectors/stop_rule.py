@@ -12,12 +12,24 @@ __all__ = ["StopRule"]
 
 @dataclass(frozen=True)
 class StopRule:
-    """A rollout ends at the first of ``consecutive`` frames in a row whose score is above ``threshold``, counting back.
+    """A rollout ends at the last of the first ``consecutive`` frames in a row whose scores are above ``threshold``.
 
-    The first frame, seen before anything was done, never counts. The paper's rule is ``StopRule(0.5, 1)``.
+    The first frame of a video, seen before anything was done, never counts. World-Env's rule (section 3.3) is
+    ``StopRule(0.5, 1)``. This is the only implementation: :class:`~worldenv_trl.envs.Reflect` streams chunks through
+    :meth:`extend`, figures and the choice of a rule (:mod:`worldenv_trl.metrics`) call :meth:`first` on whole videos.
+
+    Args:
+        threshold: in (0, 1); a score must be above it.
+        consecutive: frames, at least 1.
 
     Raises:
-        ValueError: for a threshold outside (0, 1) or less than one frame.
+        ValueError: for a threshold or a number of frames out of range.
+
+    Examples:
+        >>> scores = torch.tensor([[0.9, 0.6, 0.2, 0.7, 0.8, 0.9]])
+        >>> alive = torch.ones(1, 6, dtype=torch.bool)
+        >>> StopRule(0.5, 1).first(scores, alive), StopRule(0.5, 2).first(scores, alive)
+        (tensor([1]), tensor([4]))
     """
 
     threshold: float = 0.5
@@ -51,7 +63,12 @@ class StopRule:
         return stop, torch.where(stop, crossing.long().argmax(1), executed.sum(1) - 1), streak
 
     def first(self, scores: Tensor, alive: Tensor) -> Tensor:
-        """The frame at which whole videos are stopped: [R, T + 1] and bool [R, T + 1] -> int64 [R], -1 if never."""
+        """The frame at which each of R whole videos is stopped, int64 [R]; -1 if never.
+
+        Args:
+            scores: [R, T + 1], of every frame.
+            alive: bool [R, T + 1], frames that belong to their video.
+        """
         if scores.shape[1] < 2:
             return torch.full((len(scores),), -1, device=scores.device)
         none = torch.zeros(len(scores), dtype=torch.int64, device=scores.device)

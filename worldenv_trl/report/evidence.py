@@ -31,8 +31,8 @@ class Clip:
     task: str
     policy: str
     context_id: int
-    real_frames: Tensor  # uint8 [T + 1, 3, H, W]
-    imagined_frames: Tensor  # uint8 [T + 1, 3, H, W]
+    real_frames: Tensor  # uint8 [T + 1, 3, V H, W], V cameras one above the other
+    imagined_frames: Tensor  # uint8 [T + 1, 3, V H, W]
     real_scores: Tensor  # [T + 1], R(o_1:t, g)
     imagined_scores: Tensor  # [T + 1]
     gripper: Tensor  # [T + 1], opening in [0, 1]

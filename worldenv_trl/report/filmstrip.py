@@ -57,12 +57,13 @@ aria-label="{title}: physics left, imagination right"></video>
 def strip_svg(clip: Clip, number: int, every: int = 8) -> str:
     """Two rows of frames (physics, imagination), each above its step, and R on both over the threshold.
 
-    ``number`` names the clip on its page.
+    ``number`` names the clip on its page. Several cameras stand one above the other.
     """
     steps = len(clip.real_frames) - 1
     shown = list(range(0, steps + 1, every))
     x0, x1 = _LEFT + _FRAME / 2, _WIDTH - 12 - _FRAME / 2
-    top = 2 * (_FRAME + 4) + 22
+    tall = clip.real_frames.shape[-2] / clip.real_frames.shape[-1]
+    top = 2 * (tall * _FRAME + 4) + 22
     height = top + _CURVE + 42
 
     def px(step: float) -> float:
@@ -77,8 +78,8 @@ def strip_svg(clip: Clip, number: int, every: int = 8) -> str:
     for row, (name, colour, frames) in enumerate(
         (("physics", "real", clip.real_frames), ("imagined", "imagined", clip.imagined_frames))
     ):
-        y = row * (_FRAME + 4) + (_FRAME - size) / 2
-        out.append(f'<text class="value {colour}" x="{x0 - size / 2 - 8:.1f}" y="{y + size / 2 + 4:.1f}" '
+        y = row * (tall * _FRAME + 4) + tall * (_FRAME - size) / 2
+        out.append(f'<text class="value {colour}" x="{x0 - size / 2 - 8:.1f}" y="{y + tall * size / 2 + 4:.1f}" '
                    f'text-anchor="end">{name}</text>')  # fmt: skip
         sheet = image_uri(torch.cat(list(frames[shown]), -1))  # one image for the row, cut by the view box below
         image = (
@@ -87,7 +88,7 @@ def strip_svg(clip: Clip, number: int, every: int = 8) -> str:
         use = f'<use href="#{name}-{number}"/>'
         for index, step in enumerate(shown):
             out.append(
-                f'<svg x="{px(step) - size / 2:.1f}" y="{y:.1f}" width="{size:.1f}" height="{size:.1f}" '
+                f'<svg x="{px(step) - size / 2:.1f}" y="{y:.1f}" width="{size:.1f}" height="{tall * size:.1f}" '
                 f'viewBox="{index} 0 1 1" preserveAspectRatio="none">'
                 f"{use if index else image}</svg>"
             )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from worldenv_trl.world_models.denoiser import Denoiser
+from worldenv_trl.world_models.base import WorldModel, request
 from worldenv_trl.world_models.video_world_model import VideoWorldModel, VideoWorldModelConfig
+from worldenv_trl.world_models.window import Window
 
-__all__ = ["Denoiser", "VideoWorldModel", "VideoWorldModelConfig"]
+__all__ = ["VideoWorldModel", "VideoWorldModelConfig", "Window", "WorldModel", "request"]

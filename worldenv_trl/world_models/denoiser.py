@@ -1,54 +1,54 @@
-"""x-prediction network of the video world model: paints a chunk of frames by moving, keeping and repainting pixels."""
+"""x-prediction network of the video world model: paints a chunk of frames of every camera in one pass."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-__all__ = ["Denoiser", "from_cells", "to_cells"]
+from worldenv_trl.world_models.cells import to_cells
+from worldenv_trl.world_models.painter import Painter
 
-_CANDIDATES = 5  # last frame, first frame, moved last frame, painted, hand
-_HAND_TEXELS = (40, 36)  # about the image's resolution for a hand 0.3 m long
-_HAND_GAIN = 25.0  # the texture has much further to travel than a weight of the network
-
-
-def to_cells(images: Tensor, patch: int) -> Tensor:
-    """[*B, H, W] -> [*B, patch^2, H / patch, W / patch]: the pixels of a cell side by side, row by row."""
-    cells = images.unflatten(-1, (-1, patch)).unflatten(-3, (-1, patch))  # [*B, h, p, w, p]
-    return cells.movedim((-3, -1), (-4, -3)).contiguous().flatten(-4, -3)
+__all__ = ["Denoiser", "View"]
 
 
-def from_cells(cells: Tensor, patch: int) -> Tensor:
-    """[*B, patch^2, h, w] -> [*B, h * patch, w * patch], the inverse of :func:`to_cells`."""
-    images = cells.unflatten(-3, (patch, patch)).movedim((-4, -3), (-3, -1))  # [*B, h, p, w, p]
-    return images.contiguous().flatten(-4, -3).flatten(-2, -1)
+@dataclass(frozen=True)
+class View:
+    """What the network is told of one camera. Images are float in [-1, 1]."""
+
+    memory: Tensor
+    """[B, M, 3, H, W], remembered frames, oldest first; 0 is the first frame of the video, M - 1 the last."""
+    memory_maps: Tensor
+    """[B, M, K, h, w], action maps and tool coordinates of the remembered frames."""
+    maps: Tensor
+    """[B, C, K, h, w], the same of the frames to paint."""
+    motion: Tensor
+    """[B, C, 2], of the tool on the image since the last frame, in pixels."""
+    hand: Tensor
+    """[B, C, 2, 3], affine map from the image's coordinates to those of the hand's texture, both in [-1, 1]."""
+    reference: Tensor
+    """[B, 3, H, W]."""
 
 
 class Denoiser(nn.Module):
     """Predicts the clean chunk x_0 from a noisy one, the remembered frames and the hand's path.
 
-    A small UNet over the whole chunk works at ``1 / patch`` of the resolution. Every frame passes through one shared
-    encoder before it and one shared decoder after it, so that the trunk alone pays for time. The encoder sees where
-    every cell lies relative to the tool and is modulated by the frame's pose: an implicit image of the arm, whose looks
-    depend on its pose alone. For every pixel of every frame the decoder chooses, by a softmax, between
+    A small UNet over the whole chunk and all cameras works at ``1 / patch`` of the resolution. Every frame passes
+    through one encoder of its camera before it and one painter after it (:class:`Painter`), so that the trunk alone
+    pays for time. The encoder sees where every cell lies relative to the tool and is modulated by the frame's pose: an
+    implicit image of the arm, whose looks depend on its pose alone.
 
-    - the last frame (a static pixel is an exact copy: free and sharp),
-    - the first frame (what the arm uncovers),
-    - the last frame moved along with the tool's motion on the image plus a predicted residual flow (the arm, and what
-      it holds or pushes, stay sharp instead of being painted again in every chunk),
-    - freely painted colour,
-    - the hand: a learned texture on a plane that the tool carries, shown where projection puts it (one texture for open
-      fingers, one for closed). It stays sharp because all frames of all episodes share it.
-
-    Chunks are handled as cells [B, C, 3, P, h, w], P = patch^2 (:func:`to_cells`), the layout of the finest grid:
-    nothing is reordered between network, composition and loss.
+    Chunks are handled as cells [B, V, C, 3, P, h, w], V cameras, P = patch^2 (:func:`to_cells`).
 
     Poses, actions, noise level and the reference frame's embedding modulate the residual blocks (FiLM).
 
     Args:
+        views: V, cameras.
         chunk_length: C, frames per call.
-        memory_frames: M, remembered frames, oldest first; index 0 is the first frame of the video, M - 1 the last.
+        memory_frames: M.
         image_size: side in pixels.
         patch: pixels per cell of the network's finest grid.
         map_channels: channels of the action maps, drawn on the finest grid.
@@ -64,6 +64,7 @@ class Denoiser(nn.Module):
     def __init__(
         self,
         *,
+        views: int = 1,
         chunk_length: int,
         memory_frames: int,
         image_size: int,
@@ -79,21 +80,17 @@ class Denoiser(nn.Module):
     ) -> None:
         super().__init__()
         self.chunk_length, self.patch = chunk_length, patch
-        cell = 3 * patch**2
-        maps = map_channels
+        cell, maps = 3 * patch**2, map_channels
         widths = [width * factor for factor in multipliers]
 
         self.condition = nn.Sequential(nn.Linear(condition_dim, embedding_dim), nn.SiLU())
-        self.reference = _ReferenceEncoder(image_size, embedding_dim)
+        self.reference = nn.ModuleList(_ReferenceEncoder(image_size, embedding_dim) for _ in range(views))
         self.noise_level = nn.Linear(1, embedding_dim)
         self.embed = nn.Sequential(nn.Linear(embedding_dim, embedding_dim), nn.SiLU())
 
-        self.memory_in = nn.Conv2d(memory_frames * (cell + maps), width, 3, padding=1)
-        self.frame_in = nn.Conv2d(cell + maps, frame_channels, 3, padding=1)
-        self.frame_mid = nn.Conv2d(frame_channels, frame_channels, 3, padding=1)
-        self.pose = nn.Sequential(nn.Linear(pose_dim, 64), nn.SiLU(), nn.Linear(64, 4 * frame_channels))
-        self.noisy_in = nn.Conv2d(cell, frame_channels, 3, padding=1, bias=False)
-        self.merge = nn.Conv2d(chunk_length * frame_channels, width, 1)
+        self.memory_in = nn.Conv2d(views * memory_frames * (cell + maps), width, 3, padding=1)
+        self.encoders = nn.ModuleList(_FrameEncoder(cell, maps, frame_channels, pose_dim) for _ in range(views))
+        self.merge = nn.Conv2d(views * chunk_length * frame_channels, width, 1)
 
         self.down, self.shrink = nn.ModuleList(), nn.ModuleList()
         self.up, self.grow = nn.ModuleList(), nn.ModuleList()
@@ -105,74 +102,58 @@ class Denoiser(nn.Module):
                 self.grow.append(nn.Conv2d(widths[level + 1], channels, 1))
 
         decoder = 3 * frame_channels // 2
-        self.split = nn.Conv2d(width, chunk_length * decoder, 1)
-        self.frame_out = nn.Conv2d(decoder + frame_channels, 2 * frame_channels, 3, padding=1)
-        self.paint = nn.Conv2d(2 * frame_channels, (_CANDIDATES + 3 + 2) * patch**2, 1)  # weights, colour, flow
-        nn.init.zeros_(self.paint.weight)
-        with torch.no_grad():
-            self.paint.bias.zero_()
-            self.paint.bias[: patch**2] = 2.0  # starts as a copy of the last frame
-
-        self.hand = nn.Parameter(torch.zeros(1, 2 * 4, *_HAND_TEXELS))  # closed and open: colour, weight
-        axis = (torch.arange(image_size, dtype=torch.float32) + 0.5) * 2 / image_size - 1
-        base = torch.stack([to_cells(plane, patch) for plane in torch.meshgrid(axis, axis, indexing="xy")], -1)
-        self.register_buffer("_base", base, persistent=False)  # where every pixel is: [P, h, w, 2]
+        self.split = nn.Conv2d(width, views * chunk_length * decoder, 1)
+        self.painters = nn.ModuleList(
+            Painter(image_size, patch, decoder + frame_channels, 2 * frame_channels) for _ in range(views)
+        )
 
     def forward(
         self,
         noisy: Tensor | None,
         noise_level: Tensor,
-        memory: Tensor,
-        memory_maps: Tensor,
-        maps: Tensor,
-        motion: Tensor,
-        hand: Tensor,
+        views: Sequence[View],
         opening: Tensor,
         poses: Tensor,
         condition: Tensor,
-        reference: Tensor,
-        frames: Tensor | None = None,
     ) -> Tensor:
-        """Images are float in [-1, 1].
+        """x_0 float32 [B, V, C, 3, P, h, w].
 
         Args:
-            noisy: [B, C, 3, P, h, w], the noisy chunk, or None for zeros (which cost nothing).
+            noisy: [B, V, C, 3, P, h, w], the noisy chunk, or None for zeros (which cost nothing).
             noise_level: [B], 0 is pure noise (or nothing known), 1 is clean.
-            memory: [B, M, 3, H, W].
-            memory_maps: [B, M, K, h, w], action maps and tool coordinates of the remembered frames.
-            maps: [B, C, K, h, w], the same of the frames to paint.
-            motion: [B, C, 2], the tool's motion on the image since the last frame, in pixels.
-            hand: [B, C, 2, 3], affine map from the image's coordinates to those of the hand's texture, both in [-1, 1].
+            views: V of them.
             opening: [B, C], of the gripper.
             poses: [B, C, D'], the pose of every frame to paint.
             condition: [B, D], poses and actions of the whole chunk.
-            reference: [B, 3, H, W].
-            frames: int64 [F], which frames of the chunk to paint, or None for all. The trunk always sees the whole
-                chunk; leaving frames out saves the decoder's share.
-
-        Returns:
-            x_0 float32 [B, C or F, 3, P, h, w].
         """
-        batch, chunk = motion.shape[:2]
-        embedding = self.condition(condition) + self.reference(reference) + self.noise_level(noise_level.unsqueeze(-1))
-        embedding = self.embed(embedding)
-        motion = motion.view(batch, chunk, 1, 1, 1, 2)
-        remembered = to_cells(memory, self.patch)  # [B, M, 3, P, h, w]
+        chunk = self.chunk_length
+        embedding = self.condition(condition)
+        for view, encode in zip(views, self.reference, strict=True):
+            embedding = embedding + encode(view.reference)
+        embedding = self.embed(embedding + self.noise_level(noise_level.unsqueeze(-1)))
 
-        with torch.no_grad():
-            moved = self._move(memory[:, -1], motion).flatten(2, 3)
-            per_frame = torch.cat([moved, maps], 2).flatten(0, 1).contiguous(memory_format=torch.channels_last)
-        per_frame = self.frame_in(per_frame)
-        if noisy is not None:
-            noisy = noisy.flatten(2, 3).flatten(0, 1).contiguous(memory_format=torch.channels_last)
-            per_frame = per_frame + self.noisy_in(noisy)
-        modulation = self.pose(poses.flatten(0, 1))[..., None, None].chunk(4, 1)
-        per_frame = F.silu(torch.addcmul(modulation[0], per_frame, 1 + modulation[1]))
-        per_frame = F.silu(torch.addcmul(modulation[2], self.frame_mid(per_frame), 1 + modulation[3]))
-        inputs = torch.cat([remembered.flatten(2, 3), memory_maps], 2).flatten(1, 2)
-        trunk = self.memory_in(inputs.contiguous(memory_format=torch.channels_last))
-        trunk = trunk + self.merge(_frames_to_channels(per_frame, chunk))
+        encoded = [
+            encode(view, painter, None if noisy is None else noisy[:, index], poses)
+            for index, (view, encode, painter) in enumerate(zip(views, self.encoders, self.painters, strict=True))
+        ]  # each [B C, D, h, w]
+        remembered = [
+            torch.cat([to_cells(view.memory, self.patch).flatten(2, 3), view.memory_maps], 2).flatten(1, 2)
+            for view in views
+        ]
+        trunk = self.memory_in(_joined(remembered).contiguous(memory_format=torch.channels_last))
+        trunk = trunk + self.merge(_joined([_frames_to_channels(frames, chunk) for frames in encoded]))
+        trunk = self._trunk(trunk, embedding)
 
+        decoded = F.silu(self.split(trunk)).chunk(len(views), 1)
+        painted = [
+            paint(
+                torch.cat([_channels_to_frames(part, chunk), frames], 1), view.memory, view.motion, view.hand, opening
+            )
+            for part, frames, view, paint in zip(decoded, encoded, views, self.painters, strict=True)
+        ]
+        return painted[0].unsqueeze(1) if len(painted) == 1 else torch.stack(painted, 1)
+
+    def _trunk(self, trunk: Tensor, embedding: Tensor) -> Tensor:
         skips = []
         for level, blocks in enumerate(self.down):
             for block in blocks:
@@ -184,53 +165,12 @@ class Denoiser(nn.Module):
             trunk = skips[level] + F.interpolate(self.grow[level](trunk), scale_factor=2, mode="nearest")
             for block in self.up[level]:
                 trunk = block(trunk, embedding)
+        return trunk
 
-        decoded = _channels_to_frames(F.silu(self.split(trunk)), chunk)
-        if frames is not None:
-            every = (torch.arange(batch, device=frames.device).unsqueeze(-1) * chunk + frames).flatten()
-            decoded, per_frame, motion = decoded[every], per_frame[every], motion[:, frames]
-            hand, opening = hand[:, frames], opening[:, frames]
-        decoded = F.silu(self.frame_out(torch.cat([decoded, per_frame], 1)))
-        painted = self.paint(decoded).float().contiguous().unflatten(1, (-1, self.patch**2))
-        painted = painted.unflatten(0, (batch, motion.shape[1]))
-        sprite = self._hand(hand, opening)  # [B, C, 4, P, h, w]
-        weight = torch.cat(
-            [painted[:, :, : _CANDIDATES - 1], painted[:, :, _CANDIDATES - 1 : _CANDIDATES] + sprite[:, :, 3:]], 2
-        )
-        weight = weight.softmax(2).unsqueeze(3)  # [B, C, 5, 1, P, h, w]
-        colour, flow = painted[:, :, _CANDIDATES : _CANDIDATES + 3], painted[:, :, _CANDIDATES + 3 :]
-        moved = self._move(memory[:, -1], motion + flow.movedim(2, -1))
-        chosen = weight[:, :, 0] * remembered[:, None, -1]
-        chosen = torch.addcmul(chosen, weight[:, :, 1], remembered[:, None, 0])
-        chosen = torch.addcmul(chosen, weight[:, :, 2], moved)
-        chosen = torch.addcmul(chosen, weight[:, :, 3], colour)
-        return torch.addcmul(chosen, weight[:, :, 4], sprite[:, :, :3])
 
-    def _hand(self, affine: Tensor, opening: Tensor) -> Tensor:
-        """Colour and weight of the hand's texture at every pixel: [B, C, 2, 3], [B, C] -> [B, C, 4, P, h, w]."""
-        (batch, chunk), (cell, height, width, _) = opening.shape, self._base.shape
-        with torch.autocast(affine.device.type, enabled=False):
-            grid = self._base @ affine[..., :2].mT.view(batch, chunk, 1, 1, 2, 2) + affine[..., 2].view(
-                batch, chunk, 1, 1, 1, 2
-            )
-            sampled = F.grid_sample(
-                _HAND_GAIN * self.hand, grid.reshape(1, -1, width, 2), padding_mode="zeros", align_corners=False
-            )
-            inside = (grid.abs().amax(-1) < 1).view(batch, chunk, 1, cell, height, width)
-        sampled = sampled.view(2, 4, batch, chunk, cell, height, width).movedim(1, 3)  # [2, B, C, 4, P, h, w]
-        sampled = torch.lerp(sampled[0], sampled[1], opening.clamp(0, 1).view(batch, chunk, 1, 1, 1, 1))
-        colour, weight = sampled[:, :, :3], sampled[:, :, 3:].masked_fill(~inside, -8.0)
-        return torch.cat([colour, weight], 2)
-
-    def _move(self, image: Tensor, motion: Tensor) -> Tensor:
-        """``image`` [B, 3, H, W] moved by pixels [B, C, P or 1, h or 1, w or 1, 2]: cells [B, C, 3, P, h, w]."""
-        (batch, chunk), (cell, height, width, _) = motion.shape[:2], self._base.shape
-        with torch.autocast(image.device.type, enabled=False):
-            grid = torch.sub(self._base, motion.float(), alpha=2 / image.shape[-1])
-            # One call for the whole chunk, sampled in the order of the cells.
-            grid = grid.reshape(batch, chunk * cell * height, width, 2)
-            moved = F.grid_sample(image, grid, padding_mode="border", align_corners=False)
-        return moved.view(batch, 3, chunk, cell, height, width).transpose(1, 2)
+def _joined(parts: list[Tensor]) -> Tensor:
+    """Channels side by side; a single part is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 
 def _frames_to_channels(features: Tensor, chunk: int) -> Tensor:
@@ -243,6 +183,30 @@ def _channels_to_frames(features: Tensor, chunk: int) -> Tensor:
     """The inverse of :func:`_frames_to_channels`."""
     features = features.permute(0, 2, 3, 1).unflatten(3, (chunk, -1))  # [B, h, w, C, D]
     return features.permute(0, 3, 1, 2, 4).flatten(0, 1).permute(0, 3, 1, 2)
+
+
+class _FrameEncoder(nn.Module):
+    """Features [B C, D, h, w] of the frames to paint: the moved last frame, the maps, the pose, the noise."""
+
+    def __init__(self, cell: int, maps: int, channels: int, pose_dim: int) -> None:
+        super().__init__()
+        self.frame_in = nn.Conv2d(cell + maps, channels, 3, padding=1)
+        self.frame_mid = nn.Conv2d(channels, channels, 3, padding=1)
+        self.pose = nn.Sequential(nn.Linear(pose_dim, 64), nn.SiLU(), nn.Linear(64, 4 * channels))
+        self.noisy_in = nn.Conv2d(cell, channels, 3, padding=1, bias=False)
+
+    def forward(self, view: View, painter: Painter, noisy: Tensor | None, poses: Tensor) -> Tensor:
+        batch, chunk = view.motion.shape[:2]
+        with torch.no_grad():
+            moved = painter.move(view.memory[:, -1], view.motion.view(batch, chunk, 1, 1, 1, 2)).flatten(2, 3)
+            inputs = torch.cat([moved, view.maps], 2).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+        features = self.frame_in(inputs)
+        if noisy is not None:
+            noisy = noisy.flatten(2, 3).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+            features = features + self.noisy_in(noisy)
+        modulation = self.pose(poses.flatten(0, 1))[..., None, None].chunk(4, 1)
+        features = F.silu(torch.addcmul(modulation[0], features, 1 + modulation[1]))
+        return F.silu(torch.addcmul(modulation[2], self.frame_mid(features), 1 + modulation[3]))
 
 
 class _Block(nn.Module):

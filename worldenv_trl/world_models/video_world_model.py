@@ -2,35 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from types import SimpleNamespace
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from worldenv_trl.keys import CHUNK_LENGTH, FRAMES, POSE_DIM, TASK_ID
+from worldenv_trl.keys import CHUNK_LENGTH, NOISE_SEED, POSE_DIM, frames_key
 from worldenv_trl.kinematics import ActionMap
+from worldenv_trl.language import instructions_of
 from worldenv_trl.pretrained import Pretrained
-from worldenv_trl.world_models.denoiser import Denoiser, from_cells, to_cells
+from worldenv_trl.robot.camera import Camera
+from worldenv_trl.world_models.base import (
+    MEMORY_POSES,
+    PADDED_ACTION_DIM,
+    PADDED_ACTIONS,
+    POSES,
+    WorldModel,
+    memory_key,
+    reference_key,
+)
+from worldenv_trl.world_models.cells import from_cells, to_cells, to_float, to_uint8
+from worldenv_trl.world_models.denoiser import Denoiser, View
 from worldenv_trl.world_models.flow_matching import sample, seeded_noise
+from worldenv_trl.world_models.geometry import hand_plane, tool_coordinates
+from worldenv_trl.world_models.video_training import video_loss
 
 __all__ = ["VideoWorldModel", "VideoWorldModelConfig"]
 
-MEMORY_FRAMES = ("memory", "frames")  # uint8 [B, M, 3, H, W]
-MEMORY_POSES = ("memory", "poses")  # float32 [B, M, 13]
-REFERENCE = ("memory", "reference")  # uint8 [B, 3, H, W]
-POSES = "poses"  # float32 [B, C, 13], FK-predicted
-PADDED_ACTIONS = "padded_actions"  # float32 [B, C, 14]: dual-arm interface, unused arm zero
-NOISE_SEED = "noise_seed"  # int64 [B, 1]
-
-PADDED_ACTION_DIM = 14
 _MEMORY = 3  # first frame, the frame memory_stride back, last frame
-_HAND_CENTRE = (0.0, -0.10)  # metres along the tool's y and z axes from the tool centre
-_HAND_HALF_SIZE = (0.14, 0.16)
 _POSITION_SCALE = 10.0  # metres to the unit scale of the network's other inputs
 
 
@@ -38,8 +41,8 @@ _POSITION_SCALE = 10.0  # metres to the unit scale of the network's other inputs
 class VideoWorldModelConfig:
     """Sizes and settings of :class:`VideoWorldModel`. Plain values: it is written to ``config.json``."""
 
-    cameras: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Task id -> position, rotation and fovy_deg of the camera; see :meth:`for_cameras`."""
+    cameras: dict[str, dict[str, dict[str, Any]]] = field(default_factory=dict)
+    """Camera name -> instruction -> the :class:`~worldenv_trl.robot.camera.Camera` it is; see :meth:`for_cameras`."""
     image_size: int = 64
     chunk_length: int = CHUNK_LENGTH
     memory_stride: int = 4
@@ -59,6 +62,14 @@ class VideoWorldModelConfig:
     a CPU without AMX bfloat16 convolutions take 1.8 times as long as float32 ones."""
     rows_per_call: int = 16
     """Rows that pass through the network at once at inference; keeps activations inside the CPU cache."""
+    unroll_prob: float = 0.5
+    """In training, share of the later chunks of a window that remember the model's own frames."""
+    noise_prob: float | None = None
+    """In training, share of the rows at random noise levels; None is 0 for a deterministic model, else 0.5."""
+    l1_weight: float = 0.15
+    """In training, weight of the absolute error beside the squared one."""
+    moving_weight: float = 4.0
+    """In training, additional weight of moving pixels."""
 
     def __post_init__(self) -> None:
         for name in ("multipliers", "blocks"):
@@ -80,31 +91,39 @@ class VideoWorldModelConfig:
             raise ValueError(f"num_denoise_steps must lie between 1 and 4, got {self.num_denoise_steps}")
         if any(self.width * factor % 8 for factor in self.multipliers):
             raise ValueError(f"width times every multiplier must be a multiple of 8, got {self.width}")
+        for name, value in (("unroll_prob", self.unroll_prob), ("noise_prob", self.noise_prob)):
+            if value is not None and not 0 <= value <= 1:
+                raise ValueError(f"{name} must lie between 0 and 1, got {value}")
+        if min(self.l1_weight, self.moving_weight) < 0:
+            raise ValueError(
+                f"l1_weight and moving_weight must not be negative, got {self.l1_weight} and {self.moving_weight}"
+            )
 
     @classmethod
-    def for_cameras(cls, cameras: Mapping[int, Any], **settings) -> VideoWorldModelConfig:
-        """Config for the tasks whose ids map to a :class:`worldenv_trl.scenes.camera.Camera` each."""
+    def for_cameras(cls, cameras: Mapping[str, Mapping[str, Camera]], **settings: Any) -> VideoWorldModelConfig:
+        """Config for ``{camera name: {instruction: camera}}``: what each instruction's scene is seen through."""
         plain = {
-            str(int(task_id)): {
-                "position": tuple(float(value) for value in camera.position),
-                "rotation": tuple(tuple(float(value) for value in row) for row in camera.rotation),
-                "fovy_deg": float(getattr(camera, "fovy_deg", getattr(camera, "fovy", 45.0))),
-            }
-            for task_id, camera in cameras.items()
+            name: {text: asdict(camera) for text, camera in by_instruction.items()}
+            for name, by_instruction in cameras.items()
         }
         return cls(cameras=plain, **settings)
 
+    @property
+    def instructions(self) -> tuple[str, ...]:
+        """Those that it has cameras for."""
+        return tuple(next(iter(self.cameras.values()), {}))
 
-class VideoWorldModel(TensorDictModuleBase, Pretrained):
+
+class VideoWorldModel(WorldModel, Pretrained):
     """Action-conditioned video, one chunk of C frames a call (World-Env section 3.2, after EnerVerse-AC).
 
     Conditions: frame memory (the first frame, one ``memory_stride`` back and the last), action maps of the FK-predicted
     poses, those poses and the 14-D padded actions as a vector, and an embedding of the reference frame by modulation.
+    All cameras are painted in one pass. A camera on the hand moves with it: where the hand goes is drawn as the camera
+    saw it last, and what it sees moves the other way.
 
-    Reads (B rows): ``("memory", "frames")`` uint8 [B, M, 3, H, W], ``("memory", "poses")`` [B, M, 13],
-    ``("memory", "reference")`` uint8 [B, 3, H, W], ``poses`` [B, C, 13] (position m, rotation row-major, opening),
-    ``padded_actions`` [B, C, 14], ``task_id`` [B, 1] and, if present, ``noise_seed`` int64 [B, 1].
-    Writes ``frames`` uint8 [B, C, 3, H, W].
+    Reads a :func:`~worldenv_trl.world_models.request` and writes ``("frames", entry)`` uint8 [B, C, 3, H, W] of each
+    camera. The instruction says which calibration holds; one that it was not trained on gets the commonest.
 
     Args:
         config: sizes, cameras and sampling settings.
@@ -120,19 +139,25 @@ class VideoWorldModel(TensorDictModuleBase, Pretrained):
     config_class = VideoWorldModelConfig
 
     def __init__(self, config: VideoWorldModelConfig) -> None:
-        super().__init__()
-        if not config.cameras:
+        if not config.instructions or len({tuple(each) for each in config.cameras.values()}) > 1:
             raise ValueError(
-                "cameras is empty: build the config with VideoWorldModelConfig.for_cameras({task_id: camera})"
+                "cameras must give every camera for the same instructions, at least one: build the config with "
+                "VideoWorldModelConfig.for_cameras({name: {instruction: camera}})"
             )
+        super().__init__(
+            cameras=tuple(config.cameras),
+            image_size=config.image_size,
+            chunk_length=config.chunk_length,
+            instructions=config.instructions,
+        )
         self.config = config
-        self.in_keys = [MEMORY_FRAMES, MEMORY_POSES, REFERENCE, POSES, PADDED_ACTIONS, TASK_ID]
-        self.out_keys = [FRAMES]
         self.deterministic, self.num_denoise_steps = config.deterministic, config.num_denoise_steps
-        cameras = {int(task_id): SimpleNamespace(**camera) for task_id, camera in config.cameras.items()}
-        self.action_map = ActionMap(cameras, config.image_size // config.patch)
+        self._views = [_Calibrations(by_text) for by_text in config.cameras.values()]
+        side = config.image_size // config.patch
+        self.action_maps = torch.nn.ModuleList(ActionMap(view.distinct, side) for view in self._views)
         chunk = config.chunk_length
         self.denoiser = Denoiser(
+            views=len(self.cameras),
             chunk_length=chunk,
             memory_frames=_MEMORY,
             image_size=config.image_size,
@@ -147,126 +172,96 @@ class VideoWorldModel(TensorDictModuleBase, Pretrained):
             embedding_dim=config.embedding_dim,
         ).to(memory_format=torch.channels_last)
 
-    @property
-    def chunk_length(self) -> int:
-        return self.config.chunk_length
+    def memory_indices(self, now: Tensor) -> Tensor:
+        """The first frame, the one ``memory_stride`` back and the last: int64 [B] -> [B, 3]."""
+        return torch.stack([torch.zeros_like(now), (now - self.config.memory_stride).clamp(min=0), now], -1)
 
-    @property
-    def image_size(self) -> int:
-        return self.config.image_size
-
-    @property
-    def memory_frames(self) -> int:
-        """M."""
-        return _MEMORY
-
-    def memory_indices(self, t: Tensor) -> Tensor:
-        """Which frames of the video o_0..o_t are remembered: int64 [B] -> [B, M], newest last."""
-        return torch.stack([torch.zeros_like(t), (t - self.config.memory_stride).clamp(min=0), t], -1)
-
-    def next_memory(self, memory: Tensor, chunk: Tensor) -> Tensor:
-        """The memory one chunk later: [B, M, ...] and the chunk's [B, C, ...] -> [B, M, ...]."""
-        stride = self.config.memory_stride
-        middle = chunk[:, -1 - stride] if stride < chunk.shape[1] else memory[:, -1]
-        return torch.stack([memory[:, 0], middle, chunk[:, -1]], 1)
+    def training_loss(self, windows: TensorDictBase) -> TensorDict:
+        """See :func:`~worldenv_trl.world_models.video_training.video_loss`."""
+        return video_loss(self, windows)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._check(tensordict)
-        size = self.config.image_size
-        if tensordict.shape[0] == 0:
-            empty = torch.zeros(0, self.chunk_length, 3, size, size, dtype=torch.uint8, device=tensordict[POSES].device)
-            return tensordict.set(FRAMES, empty)
+        texts, rows = instructions_of(tensordict), self.config.rows_per_call
+        self.seen.check(texts)
         with torch.no_grad():
-            parts = [self._generate(part) for part in tensordict.split(self.config.rows_per_call)]
-        return tensordict.set(FRAMES, torch.cat(parts))
+            parts = [
+                self._generate(part, texts[start : start + rows])
+                for start, part in zip(range(0, len(texts), rows), tensordict.split(rows), strict=True)
+            ]
+        size, device = self.image_size, tensordict[POSES].device
+        empty = torch.zeros(0, len(self.cameras), self.chunk_length, 3, size, size, dtype=torch.uint8, device=device)
+        frames = torch.cat(parts) if parts else empty
+        for index, camera in enumerate(self.cameras):
+            tensordict.set(frames_key(camera), frames[:, index])
+        return tensordict
 
-    def _generate(self, tensordict: TensorDictBase) -> Tensor:
-        size, rows, patch = self.config.image_size, tensordict.shape[0], self.config.patch
-        conditions, device = self.conditions(tensordict), tensordict[POSES].device
+    def _generate(self, tensordict: TensorDictBase, texts: Sequence[str]) -> Tensor:
+        """uint8 [B, V, C, 3, H, W]."""
+        size, rows, patch = self.image_size, tensordict.shape[0], self.config.patch
+        conditions, device = self.conditions(tensordict, texts), tensordict[POSES].device
         if self.deterministic:
             clean = self.predict(None, torch.zeros(rows, device=device), conditions)
         else:
-            seed, shape = tensordict.get(NOISE_SEED, None), (self.chunk_length, 3, size, size)
+            shape = (len(self.cameras), self.chunk_length, 3, size, size)
+            seed = tensordict.get(NOISE_SEED, None)
             noise = torch.randn(rows, *shape, device=device) if seed is None else seeded_noise(seed, shape)
             noise = to_cells(noise, patch)
             clean = sample(lambda x, level: self.predict(x, level, conditions), noise, self.num_denoise_steps)
         return to_uint8(from_cells(clean, patch))
 
-    def conditions(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+    def conditions(self, tensordict: TensorDictBase, texts: Sequence[str]) -> dict[str, Any]:
         """What the denoiser knows besides the noisy chunk: its keyword arguments, computed once for all steps."""
         memory_poses, poses = tensordict[MEMORY_POSES].float(), tensordict[POSES].float()
-        task_id = tensordict[TASK_ID]
         every = torch.cat([memory_poses, poses], 1)  # [B, M + C, 13]
-        with torch.no_grad():
-            pixels = self.action_map.project(every[..., :3], task_id)  # cells of the finest grid
-            maps = torch.cat([self.action_map(every, task_id), self._tool_coordinates(pixels)], 2)
-        motion = (pixels[:, _MEMORY:] - pixels[:, _MEMORY - 1 : _MEMORY]) * self.config.patch
         vectors = self._pose_vectors(every)
         return {
-            "memory": to_float(tensordict[MEMORY_FRAMES]),
-            "memory_maps": maps[:, :_MEMORY],
-            "maps": maps[:, _MEMORY:],
-            "motion": motion.clamp(-self.config.image_size, self.config.image_size),
-            "hand": self._hand_plane(poses, pixels[:, _MEMORY:], task_id),
+            "views": [self._view(index, tensordict, every, texts) for index in range(len(self.cameras))],
             "opening": poses[..., 12],
             "poses": vectors[:, _MEMORY:],
             "condition": torch.cat([vectors.flatten(1), tensordict[PADDED_ACTIONS].float().flatten(1)], -1),
-            "reference": to_float(tensordict[REFERENCE]),
         }
 
-    def predict(
-        self, noisy: Tensor | None, level: Tensor, conditions: dict[str, Tensor], frames: Tensor | None = None
-    ) -> Tensor:
+    @torch.no_grad()
+    def _view(self, index: int, tensordict: TensorDictBase, every: Tensor, texts: Sequence[str]) -> View:
+        """What one camera shows; ``every`` [B, M + C, 13] are the poses of memory and chunk."""
+        camera, calibrations, action_map = self.cameras[index], self._views[index], self.action_maps[index]
+        which = calibrations.indices(texts).to(every.device)  # [B]
+        poses, size = every[:, _MEMORY:], self.image_size
+        mounted = calibrations.mounted[which]  # [B]
+        if calibrations.any_mounted:
+            seen_from = every[:, _MEMORY - 1 : _MEMORY].expand_as(every)  # the camera, as it saw the last frame
+            drawn = {"tool_pose": seen_from}
+            carried = torch.where(mounted.to(every.device).view(-1, 1, 1), poses, seen_from[:, _MEMORY:])
+            along = {"tool_pose": carried}
+        else:
+            drawn, along = {}, {}
+        pixels = action_map.project(every[..., :3], which, **drawn)  # cells of the finest grid
+        maps = torch.cat([action_map(every, which, **drawn), tool_coordinates(pixels, action_map.height)], 2)
+        motion = (pixels[:, _MEMORY:] - pixels[:, _MEMORY - 1 : _MEMORY]) * self.config.patch
+        if calibrations.any_mounted:
+            motion = torch.where(mounted.to(motion.device).view(-1, 1, 1), -motion, motion)
+        return View(
+            memory=to_float(tensordict[memory_key(camera)]),
+            memory_maps=maps[:, :_MEMORY],
+            maps=maps[:, _MEMORY:],
+            motion=motion.clamp(-size, size),
+            hand=hand_plane(poses, lambda points: action_map.project(points, which, **along), action_map.height),
+            reference=to_float(tensordict[reference_key(camera)]),
+        )
+
+    def predict(self, noisy: Tensor | None, level: Tensor, conditions: dict[str, Any]) -> Tensor:
         """x_0 from the noisy chunk (None: zeros) at noise level [B] (0: pure noise or zeros).
 
-        Both are float cells [B, C, 3, patch^2, h, w] of images in [-1, 1], see :func:`to_cells`. ``frames`` int64 [F]
-        asks for some frames of the chunk only.
+        Both are float cells [B, V, C, 3, patch^2, h, w] of images in [-1, 1], see :func:`to_cells`.
         """
         with torch.autocast(level.device.type, torch.bfloat16, enabled=self._bfloat16(level.device)):
-            return self.denoiser(noisy, level, **conditions, frames=frames)
+            return self.denoiser(noisy, level, **conditions)
 
     def _bfloat16(self, device: torch.device) -> bool:
         if self.config.precision == "auto":
             return device.type != "cpu" or torch.cpu._is_amx_tile_supported()
         return self.config.precision == "bfloat16"
-
-    def _tool_coordinates(self, pixels: Tensor) -> Tensor:
-        """Every cell's offset from the tool, saturating far and, once more, near it: [*B, 2] -> [*B, 4, h, w]."""
-        side = self.action_map.height
-        axis = torch.arange(side, device=pixels.device, dtype=torch.float32) + 0.5
-        offset = (axis - pixels.unsqueeze(-1)) / side  # [*B, 2, side]
-        offset = torch.cat([torch.tanh(3 * offset), torch.tanh(12 * offset)], -2)
-        across = offset[..., ::2, None, :].expand(*pixels.shape[:-1], 2, side, side)
-        down = offset[..., 1::2, :, None].expand(*pixels.shape[:-1], 2, side, side)
-        return torch.cat([across, down], -3)
-
-    @torch.no_grad()
-    def _hand_plane(self, poses: Tensor, origin: Tensor, task_id: Tensor) -> Tensor:
-        """Image coordinates -> coordinates on the plane of the tool's y and z axes (affine): [B, C, 2, 3].
-
-        Args:
-            poses: [B, C, 13].
-            origin: [B, C, 2], the projected tool centre in cells.
-            task_id: [B, 1].
-        """
-        side, reach = self.action_map.height, 0.05
-        axes = poses[..., 3:12].unflatten(-1, (3, 3)).mT[..., 1:, :]  # [B, C, axis y or z, 3]
-        ends = torch.stack(
-            [self.action_map.project(poses[..., :3] + reach * axes[..., i, :], task_id) for i in (0, 1)], -1
-        )
-        # Image coordinates in [-1, 1] per metre along y and z: [B, C, 2, 2].
-        jacobian = (ends - origin.unsqueeze(-1)) * (2 / side / reach)
-        (a, b), (c, d) = (row.unbind(-1) for row in jacobian.unbind(-2))
-        # A plane seen edge-on would be sampled infinitely wide.
-        det = a * d - b * c
-        least = 0.1 * (b.square() + d.square()) + 1e-2
-        det = torch.where(det < 0, -1.0, 1.0) * det.abs().clamp(min=least)
-        inverse = torch.stack([torch.stack([d, -b], -1), torch.stack([-c, a], -1)], -2) / det[..., None, None]
-        half = inverse.new_tensor(_HAND_HALF_SIZE).unsqueeze(-1)
-        matrix = inverse / half
-        centre = origin * (2 / side) - 1
-        offset = -(matrix @ centre.unsqueeze(-1)) - inverse.new_tensor(_HAND_CENTRE).unsqueeze(-1) / half
-        return torch.cat([matrix, offset], -1)
 
     @staticmethod
     def _pose_vectors(poses: Tensor) -> Tensor:
@@ -276,23 +271,32 @@ class VideoWorldModel(TensorDictModuleBase, Pretrained):
         return torch.cat([position - origin, 0.3 * position, poses[..., 3:]], -1)
 
     def _check(self, tensordict: TensorDictBase) -> None:
-        size, chunk = self.config.image_size, self.chunk_length
-        frames = tensordict[MEMORY_FRAMES]
-        if frames.dtype != torch.uint8 or tuple(frames.shape[1:]) != (_MEMORY, 3, size, size):
-            raise ValueError(
-                f"{MEMORY_FRAMES} must be uint8 [B, {_MEMORY}, 3, {size}, {size}], "
-                f"got {frames.dtype} {tuple(frames.shape)}"
-            )
+        size, chunk = self.image_size, self.chunk_length
+        for camera in self.cameras:
+            frames = tensordict.get(memory_key(camera), None)
+            if frames is None or frames.dtype != torch.uint8 or tuple(frames.shape[1:]) != (_MEMORY, 3, size, size):
+                got = "nothing" if frames is None else f"{frames.dtype} {tuple(frames.shape)}"
+                raise ValueError(f"{memory_key(camera)} must be uint8 [B, {_MEMORY}, 3, {size}, {size}], got {got}")
         for key, width in ((POSES, POSE_DIM), (PADDED_ACTIONS, PADDED_ACTION_DIM)):
             if tuple(tensordict[key].shape[1:]) != (chunk, width):
                 raise ValueError(f"{key} must be [B, {chunk}, {width}], got {tuple(tensordict[key].shape)}")
 
 
-def to_float(images: Tensor) -> Tensor:
-    """uint8 images -> float in [-1, 1]."""
-    return images.float() * (2 / 255) - 1
+class _Calibrations:
+    """The distinct calibrations of one camera, and which of them an instruction's scene has."""
 
+    def __init__(self, by_instruction: Mapping[str, Mapping[str, Any]]) -> None:
+        self.distinct: list[Camera] = []
+        self._index: dict[str, int] = {}
+        for text, values in by_instruction.items():
+            camera = Camera(**values)
+            if camera not in self.distinct:
+                self.distinct.append(camera)
+            self._index[text] = self.distinct.index(camera)
+        self._commonest = Counter(self._index.values()).most_common(1)[0][0]
+        self.mounted = torch.tensor([camera.mount == "tool" for camera in self.distinct])
+        self.any_mounted = bool(self.mounted.any())
 
-def to_uint8(images: Tensor) -> Tensor:
-    """Float images in [-1, 1] -> uint8, rounded."""
-    return ((images + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
+    def indices(self, texts: Sequence[str]) -> Tensor:
+        """int64 [n]."""
+        return torch.tensor([self._index.get(text, self._commonest) for text in texts], dtype=torch.int64)

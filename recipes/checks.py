@@ -1,0 +1,69 @@
+"""What is wrong with settings, before any long work starts."""
+
+from __future__ import annotations
+
+from config import WorldEnvConfig
+from physics import tabletop
+from worldenv_trl.scenes import load_task
+
+
+def check_config(config: WorldEnvConfig) -> None:
+    """Fails before any long work starts if a task is unknown, a setting impossible or no GL backend renders."""
+    if not config.tasks:
+        raise ValueError("tasks is empty: name at least one task, for instance starter/open_the_top_drawer")
+    if len(set(config.tasks)) < len(config.tasks):
+        raise ValueError(f"tasks names a task twice: {', '.join(config.tasks)}")
+    for name, value, known in (
+        ("post_train.env", config.post_train.env, ("imagined", "tabletop")),
+        ("post_train.ratio_level", config.post_train.ratio_level, ("step", "chunk")),
+    ):
+        if value not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    for name, value in (
+        ("num_threads", config.num_threads),
+        ("rounds", config.rounds),
+        ("train_states", config.train_states),
+        ("demonstrate.episodes_per_task", config.demonstrate.episodes_per_task),
+        ("explore.episodes_per_task", config.explore.episodes_per_task),
+        ("explore.num_envs", config.explore.num_envs),
+        ("sft.steps", config.sft.steps),
+        ("world_model.steps", config.world_model.steps),
+        ("post_train.iterations", config.post_train.iterations),
+        ("post_train.groups", config.post_train.groups),
+        ("evaluate.episodes_per_task", config.evaluate.episodes_per_task),
+    ):
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+    if config.post_train.group_size < 2:
+        raise ValueError(f"post_train.group_size must be at least 2, got {config.post_train.group_size}")
+    if not config.explore.scale_factors or min(config.explore.scale_factors) < 0:
+        raise ValueError(
+            f"explore.scale_factors must be one number or more, none negative, got {config.explore.scale_factors}"
+        )
+    for name, value in (
+        ("world_model.failure_share", config.world_model.failure_share),
+        ("world_model.holdout", config.world_model.holdout),
+        ("reflector.imagined_share", config.reflector.imagined_share),
+        ("reflector.holdout", config.reflector.holdout),
+    ):
+        if value is not None and not 0 <= value <= 1:
+            raise ValueError(f"{name} must lie between 0 and 1, got {value}")
+    if not all(floor > 0 for floor in config.scale_floor):
+        raise ValueError(f"scale_floor must be positive, got {config.scale_floor}")
+    if not 0 <= config.scale_share <= 1:
+        raise ValueError(f"scale_share must lie between 0 and 1, got {config.scale_share}")
+    if config.image_size < 32 or config.image_size % 16:
+        raise ValueError(f"image_size must be a multiple of 16 px and at least 32, got {config.image_size}")
+    if config.max_steps < 1 or config.max_steps % config.chunk_length:
+        raise ValueError(f"max_steps must be a multiple of chunk_length={config.chunk_length}, got {config.max_steps}")
+    names = [load_task(task).name for task in config.tasks]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"two of the tasks are called {name!r}: rename one of the files")
+    cell = 2 * config.world_model.patch
+    if config.image_size % cell:
+        raise ValueError(
+            f"image_size must be a multiple of twice world_model.patch={config.world_model.patch}, "
+            f"got {config.image_size}"
+        )
+    tabletop(config, "train", len(config.tasks), None).close()

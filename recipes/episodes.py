@@ -1,0 +1,40 @@
+"""The run's recorded rollouts as episodes, read from disk where training needs their frames."""
+
+from __future__ import annotations
+
+import torch
+
+from run import Run
+from worldenv_trl import keys
+from worldenv_trl.data import Episodes, episodes_from_rollouts, fill_store, open_store
+from worldenv_trl.record import read_rollouts
+
+
+def demonstrations(run: Run) -> Episodes:
+    """In memory: they are few."""
+    return episodes_from_rollouts(read_rollouts(run.folder.require_rollouts("demonstrations", "demonstrate")))
+
+
+def demonstrations_and_exploration(run: Run, rounds: int) -> tuple[Episodes, Episodes]:
+    """Demonstrations, and the exploration of the first ``rounds`` rounds; frames stay on disk, in ``episodes/``."""
+    files = [run.folder.require_rollouts("demonstrations", "demonstrate")]
+    names = ["explore" + ("" if number == 1 else f"_{number}") for number in range(1, rounds + 1)]
+    files += [run.folder.require_rollouts(name, "explore") for name in names]
+    store = run.folder.path / "episodes"
+    try:
+        parts = open_store(store, files)
+    except FileNotFoundError:
+        parts = fill_store(store, files)
+    except ValueError as error:  # the recordings are the record: nothing is lost with a store
+        print(f"{error}; it is made anew")
+        parts = fill_store(store, files)
+    return parts[0], Episodes.cat(parts[1:])
+
+
+def split_by_context(episodes: Episodes, share: float, seed: int) -> tuple[Episodes, Episodes]:
+    """Episodes for training, and those of a ``share`` of the initial states (at least one) for figures."""
+    contexts = episodes[keys.CONTEXT_ID].squeeze(-1)
+    distinct = contexts.unique()
+    order = torch.randperm(len(distinct), generator=torch.Generator().manual_seed(seed))
+    kept_out = torch.isin(contexts, distinct[order[: max(1, round(share * len(distinct)))]])
+    return episodes[~kept_out], episodes[kept_out]

@@ -1,0 +1,65 @@
+"""The tabletop in MuJoCo as the stages use it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import InitTracker, TransformedEnv
+from torchrl.modules import MultiStepActorWrapper
+
+from config import WorldEnvConfig
+from parts import PROPRIO
+from worldenv_trl.envs import TabletopEnv, chunked
+from worldenv_trl.policies import LaplaceActor, Policy, laplace_actor, scale_bounds
+from worldenv_trl.record import provenance
+
+
+def tabletop(config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[str] | None, **options) -> TabletopEnv:
+    """Some of the run's tasks (all by default), each under its number in the run."""
+    tasks = list(config.tasks if tasks is None else tasks)
+    options = {"seed": config.seed, "num_threads": config.num_threads, "cameras": config.cameras} | options
+    if split == "train":
+        options = {"init_state_count": config.train_states} | options
+    return TabletopEnv(
+        tasks if len(tasks) > 1 else tasks[0],
+        num_envs=num_envs,
+        image_size=config.image_size,
+        init_split=split,
+        max_steps=config.max_steps,
+        proprio=PROPRIO,
+        task_ids=[config.tasks.index(task) for task in tasks],
+        **options,
+    )
+
+
+def step_env(
+    config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[str] | None = None, **options
+) -> TransformedEnv:
+    """Physics, one action a step (every frame is seen), with the ``is_init`` that :func:`chunk_player` needs."""
+    return TransformedEnv(tabletop(config, split, num_envs, tasks, **options), InitTracker())
+
+
+def physics_waves_env(config: WorldEnvConfig, groups: int, group_size: int) -> EnvBase:
+    """Physics, one chunk a step, rows in groups that share an initial state: LOOP's upper bound."""
+    return chunked(
+        tabletop(config, "train", groups * group_size, None, group_repeats=group_size, with_sim_state=True),
+        config.chunk_length,
+    )
+
+
+def chunk_player(actor: LaplaceActor, chunk_length: int) -> MultiStepActorWrapper:
+    """Plays the actor's chunks open loop, one action a step. Its log-probs are stale: never train on them."""
+    return MultiStepActorWrapper(actor, n_steps=chunk_length)
+
+
+def exploring_actor(config: WorldEnvConfig, policy: Policy, scale_factor: float) -> LaplaceActor:
+    """The stochastic actor of exploration and LOOP, its scale bounded below."""
+    bounds = scale_bounds(policy, config.scale_floor, share=config.scale_share)
+    return laplace_actor(policy, scale_factor=scale_factor, log_scale_bounds=bounds)
+
+
+def recording(config: WorldEnvConfig, env: EnvBase, stage: str, models: dict | None = None, **more) -> dict:
+    """What a recording of a stage must say about itself, so that it can be replayed: options of RolloutWriter."""
+    more = {"stage": stage, "seed": config.seed} | more
+    return provenance(env, models=models, config=config, tasks=config.tasks, **more)

@@ -1,0 +1,52 @@
+"""The honest probe of a post-training run: the policy in the physics, looked at and never learned from."""
+
+from __future__ import annotations
+
+import torch
+
+from config import PostTrain
+from imagination import Imagination
+from outcomes import greedy_outcomes, physics_outcomes
+from run import Run
+from worldenv_trl.metrics import HonestyAlarm, honesty
+
+
+def probed_iterations(settings: PostTrain) -> set[int]:
+    """Every ``probe_every``-th iteration, the first and the last."""
+    if not settings.probe_every:
+        return set()
+    return {*range(0, settings.iterations, settings.probe_every), settings.iterations - 1}
+
+
+def probe(run: Run, actor, imagination: Imagination | None, alarm: HonestyAlarm | None) -> dict[str, float]:
+    """Greedy success on training contexts: in the physics (the reflector not involved) and in imagination."""
+    config = run.config
+    count = config.post_train.probe_contexts
+    if imagination is None:
+        indices = torch.linspace(0, config.train_states - 1, min(count, config.train_states)).long().tolist()
+        real = [physics_outcomes(run, actor, task, "train", len(indices), indices=indices) for task in config.tasks]
+        return {"real_success": torch.cat(real).float().mean().item(), "probe_episodes": len(torch.cat(real))}
+    real, imagined = greedy_outcomes(run, actor, imagination, count)
+    report = honesty(imagined, real)
+    watch = alarm.update(imagined, real)
+    return {
+        "real_success": report["real"],
+        "imagined_success": report["imagined"],
+        "imagined_precision": report["precision"],
+        "imagined_recall": report["recall"],
+        "probe_episodes": report["n"],
+        "honesty_alarm": float(watch.fired),
+        "honesty_p": watch.p_value,
+        "imagined_rise": watch.imagined_rise,
+        "real_rise": watch.real_rise,
+    }
+
+
+def warning(target: str, iteration: int, metrics: dict[str, float]) -> str:
+    return (
+        f"warning: {target}, iteration {iteration}: imagined success has risen by {100 * metrics['imagined_rise']:.1f} "
+        f"points since the first probes, real success by {100 * metrics['real_rise']:+.1f} (now "
+        f"{100 * metrics['imagined_success']:.0f} % and {100 * metrics['real_success']:.0f} % of "
+        f"{metrics['probe_episodes']} training contexts, p = {metrics['honesty_p']:.2g}): "
+        "the policy may be learning the world model's errors; training goes on"
+    )

@@ -1,0 +1,72 @@
+"""One run: its settings, its folder and its parts. Every stage gets one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+
+import torch
+
+from config import WorldEnvConfig
+from parts import COMPACT, Parts
+from run_folder import RunFolder
+from worldenv_trl.kinematics import ForwardKinematics
+from worldenv_trl.policies import Policy
+from worldenv_trl.reflectors import Reflector, StopRule
+from worldenv_trl.world_models import WorldModel
+
+RULES = "stop_rules.json"
+
+
+@dataclass(frozen=True)
+class Run:
+    config: WorldEnvConfig
+    folder: RunFolder
+    parts: Parts = COMPACT
+
+    @cached_property
+    def kinematics(self) -> ForwardKinematics:
+        return self.parts.kinematics()
+
+    def seed_everything(self, offset: int) -> None:
+        """Each stage has its own stream, so a stage run alone draws the same numbers as in the whole loop."""
+        torch.manual_seed(1000 * self.config.seed + offset)
+
+    def policy(self, name: str, stage: str) -> Policy:
+        return self.parts.policy.load(self.folder.require_checkpoint(name, stage))
+
+    def world_model(self, suffix: str = "") -> WorldModel:
+        path = self.folder.require_checkpoint(f"world_model{suffix}", "train_world_model")
+        return self.parts.world_model.load(path).eval()
+
+    def reflector(self, suffix: str = "") -> Reflector:
+        path = self.folder.require_checkpoint(f"reflector{suffix}", "train_reflector")
+        return self.parts.reflector.load(path).eval().requires_grad_(False)
+
+    def rules(self, suffix: str = "") -> dict[str, StopRule]:
+        """When the reflector stops ``imagined`` and ``real`` rollouts."""
+        return read_rules(self.folder.require_checkpoint(f"reflector{suffix}", "train_reflector"))
+
+
+def write_rules(folder: Path, rules: dict[str, StopRule]) -> None:
+    """Leaves the stop rules beside a reflector's weights."""
+    (folder / RULES).write_text(json.dumps({name: asdict(rule) for name, rule in rules.items()}, indent=2) + "\n")
+
+
+def read_rules(folder: Path) -> dict[str, StopRule]:
+    """What :func:`write_rules` left.
+
+    Raises:
+        FileNotFoundError: if there are none.
+        ValueError: if they cannot be read.
+    """
+    try:
+        return {name: StopRule(**values) for name, values in json.loads((folder / RULES).read_text()).items()}
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{folder / RULES} is missing: run the stage 'train_reflector' again") from error
+    except (json.JSONDecodeError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{folder / RULES} holds no stop rules ({error}): run the stage 'train_reflector' again"
+        ) from error

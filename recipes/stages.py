@@ -1,0 +1,138 @@
+"""The machinery of stages: their order, and running all of them or one. It knows no stage; each is given to it."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+import tyro
+
+from checks import check_config
+from config import PRESETS, WorldEnvConfig
+from parts import COMPACT, Parts
+from run import Run
+from run_folder import RunFolder
+
+Work = Callable[..., None]
+"""``work(run, **options)``: what a stage does."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    name: str
+    kind: str
+    makes: str
+    """What it leaves in the run folder; without it the stage counts as not finished."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+def plan(config: WorldEnvConfig) -> list[Stage]:
+    """World-Env's Algorithm 1 as a list; a later round continues from the policy that the round before reached."""
+    stages = [
+        Stage("demonstrate", "demonstrate", "rollouts/demonstrations.mcap"),
+        Stage("sft", "sft", "checkpoints/sft"),
+    ]
+    if config.post_train.env == "tabletop":  # the upper bound needs neither world model nor reflector
+        learn = {"source": "sft", "target": "post_train", "models": ""}
+        judge = {"before": "sft", "after": "post_train", "models": None}
+        stages.append(Stage("post_train", "post_train", "checkpoints/post_train", learn))
+        return [*stages, Stage("evaluate", "evaluate", "metrics.jsonl", judge)]
+    policy, previous, models = "sft", None, ""
+    for number in range(1, config.rounds + 1):
+        models = "" if number == 1 else f"_{number}"
+        explored, world, judge, improved = (
+            f"{name}{models}" for name in ("explore", "world_model", "reflector", "post_train")
+        )
+        see = {"policy": policy, "target": explored}
+        dream = {"target": world, "previous": previous, "rounds": number}
+        score = {"target": judge, "models": models, "rounds": number}
+        learn = {"source": policy, "target": improved, "models": models}
+        stages += [
+            Stage(explored, "explore", f"rollouts/{explored}.mcap", see),
+            Stage(world, "train_world_model", f"checkpoints/{world}", dream),
+            Stage(judge, "train_reflector", f"checkpoints/{judge}", score),
+            Stage(improved, "post_train", f"checkpoints/{improved}", learn),
+        ]
+        policy, previous = improved, world
+    options = {"before": "sft", "after": policy, "models": models}
+    return [*stages, Stage("evaluate", "evaluate", "metrics.jsonl", options)]
+
+
+def run_stages(run: Run, works: Mapping[str, Work]) -> None:
+    """Runs what is not finished yet; ``works`` says what a kind of stage does."""
+    for stage in plan(run.config):
+        if _finished(stage, run.folder):
+            print(f"{stage.name}: finished, skipped")
+        else:
+            _run(stage, works[stage.kind], run)
+
+
+def run_alone(kind: str, work: Work, arguments: Sequence[str] | None = None, parts: Parts = COMPACT) -> None:
+    """Runs one stage of a preset alone, again if it is finished; of several rounds, the first unfinished one.
+
+    The stages after it, which learned from what it made before, count as not finished from then on.
+    """
+    config = parse(sys.argv[1:] if arguments is None else arguments, work.__module__)
+    rerun(kind, work, open_run(config, parts))
+
+
+def rerun(kind: str, work: Work, run: Run) -> None:
+    """See :func:`run_alone`."""
+    stages = plan(run.config)
+    same = [index for index, stage in enumerate(stages) if stage.kind == kind]
+    if not same:
+        raise SystemExit(f"these settings have no stage {kind!r}: {', '.join(stage.name for stage in stages)}")
+    index = next((index for index in same if not _finished(stages[index], run.folder)), same[-1])
+    for later in stages[index + 1 :]:
+        run.folder.forget(later.name)
+    _run(stages[index], work, run)
+
+
+def parse(arguments: Sequence[str], module: str = "__main__") -> WorldEnvConfig:
+    """The settings of a command line; its help begins with what ``module`` says of itself."""
+    return tyro.extras.overridable_config_cli(PRESETS, args=arguments, description=sys.modules[module].__doc__)
+
+
+def open_run(config: WorldEnvConfig, parts: Parts = COMPACT) -> Run:
+    """The run of checked settings; what is wrong with them is said in one line."""
+    try:
+        check_config(config)
+        folder = RunFolder(config.run_dir)
+        folder.open(config)
+    except (ValueError, OSError, RuntimeError) as error:
+        raise SystemExit(f"error: {error}") from error
+    torch.set_num_threads(config.num_threads)
+    return Run(config, folder, parts)
+
+
+def _finished(stage: Stage, folder: RunFolder) -> bool:
+    return folder.done(stage.name) and (folder.path / stage.makes).exists()
+
+
+def _run(stage: Stage, work: Work, run: Run) -> None:
+    """Runs a stage; Ctrl-C ends the program with one line, wherever it strikes."""
+    interrupted = threading.Event()
+
+    def interrupt(number: int, frame: object) -> None:
+        interrupted.set()
+        signal.default_int_handler(number, frame)
+
+    here = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, interrupt) if here else None
+    try:
+        with run.folder.stage(stage.name):
+            work(run, **stage.options)
+    except BaseException as error:
+        if not interrupted.is_set():
+            raise
+        # Libraries may have turned the KeyboardInterrupt into an error of their own.
+        message = f"interrupted in stage {stage.name}: the same command continues"
+        raise SystemExit(f"\n{message}, finished stages are kept") from error
+    finally:
+        if here:
+            signal.signal(signal.SIGINT, before)

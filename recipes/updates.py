@@ -1,0 +1,59 @@
+"""LOOP's update: clipped steps on one batch of decisions."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from config import PostTrain
+
+PATIENCE = 3  # iterations
+STUCK = (
+    "warning: {}, iteration {}: for {} iterations the first update alone has moved the policy by more than max_kl={}, "
+    "so nearly nothing is learned: the scale of a dimension may be too small for how far its mean moves "
+    "(--scale-floor, --scale-share), or the learning rates too large"
+)
+
+
+def rate_factor(iteration: int, settings: PostTrain) -> float:
+    """Linear warm-up, then half a cosine down to a tenth."""
+    warmup = (iteration + 1) / (settings.warmup_iterations + 1)
+    return min(warmup, 0.55 + 0.45 * math.cos(math.pi * iteration / settings.iterations))
+
+
+def update(decisions, total_steps, loss, optimizer, parameter_groups, settings) -> dict[str, float]:
+    """K epochs of clipped updates on one batch of decisions, stopped when the policy has moved too far.
+
+    Without a decision that teaches something there is no update: the optimiser's moments would move the policy alone.
+    """
+    sums: dict[str, float] = {}
+    count, stopped = 0, False
+    if not len(decisions):
+        return {"updates": 0, "kl_stop": 0.0}
+    for _ in range(settings.epochs):
+        for rows in torch.randperm(len(decisions)).split(settings.minibatch_size):
+            batch = decisions[rows]
+            # A minibatch stands for its share of the whole batch.
+            batch["total_steps"] = (total_steps * len(rows) / len(decisions)).expand(len(rows), 1)
+            out = loss(batch)
+            if out["kl_approx"].item() > settings.max_kl:
+                stopped = True
+                break
+            optimizer.zero_grad()
+            out["loss_objective"].backward()
+            for parameters in parameter_groups:
+                torch.nn.utils.clip_grad_norm_(parameters, settings.max_grad_norm)
+            optimizer.step()
+            count += 1
+            for name, value in out.items():
+                if value.numel() == 1:
+                    sums[name] = sums.get(name, 0.0) + value.item()
+        if stopped:
+            break
+    return {name: value / max(count, 1) for name, value in sums.items()} | {"updates": count, "kl_stop": float(stopped)}
+
+
+def stuck(before: int, metrics: dict[str, float]) -> int:
+    """Iterations in a row, this one included, whose first update alone went too far."""
+    return before + 1 if metrics["kl_stop"] and metrics["updates"] <= 1 else 0

@@ -1,0 +1,5 @@
+"""Rollouts for LOOP: complete groups behind TorchRL's collector interface."""
+
+from worldenv_trl.collectors.group_collector import GroupCollector
+
+__all__ = ["GroupCollector"]

@@ -1,0 +1,256 @@
+"""Complete groups of rollouts behind TorchRL's collector interface."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import nn
+from torchrl.collectors import BaseCollector
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from worldenv_trl import keys
+from worldenv_trl.policies import Policy, check_pairing
+
+__all__ = ["GroupCollector"]
+
+_READ = (("next", "reward"), ("next", "done"))  # by the collector itself
+
+
+class GroupCollector(BaseCollector):
+    """Waves of rollouts in which every row runs to its own end: groups are complete, none is cut or started twice.
+
+    Stock collectors reset rows as they finish, which leaves the groups of a leave-one-out baseline unfinished and
+    biased. Here a wave resets all rows, rolls until every row is done, and marks what each rollout executed.
+
+    Where TorchRL's collectors count frames, this one counts groups; the rest of the interface is theirs.
+
+    Args:
+        env: batch ``[G, N]``, or a flat ``[G * N]`` with ``group_size=N`` (consecutive rows are a group).
+        policy: the behaviour policy; it must not change while a batch is collected. Every
+            :class:`~worldenv_trl.policies.Policy` in it is checked against the env.
+
+    Keyword Args:
+        groups_per_batch: groups in each yielded batch, a multiple of ``G``.
+        total_groups: stop after so many; -1 never stops.
+        group_size: see ``env``.
+        max_decisions: longest rollout in env steps (decisions, for a chunked env); default 10,000.
+        exploration_type: of the policy; ``DETERMINISTIC`` is greedy.
+        exclude: entries that no one reads, left out of every step as soon as it is over; none by default. See
+            :attr:`exclude`.
+
+    Yields:
+        TensorDict ``[groups, N, T]`` as ``env.rollout`` writes it, with ``("collector", "mask")`` bool [groups, N, T]:
+        False after a rollout's end, and ``returns`` float32 [groups, N, T]: the sum of the rollout's rewards, the same
+        at each of its entries.
+
+    Raises:
+        ValueError: if sizes do not divide or are below 1, a policy was trained for another env, or ``exclude`` names
+            reward or done flags.
+
+    Examples:
+        >>> from worldenv_trl.envs import TabletopEnv, chunked
+        >>> from worldenv_trl.objectives import rloo_advantage
+        >>> options = {"cameras": (), "max_steps": 16, "seed": 0}  # nothing is drawn
+        >>> env = chunked(TabletopEnv("starter/open_the_top_drawer", 6, group_repeats=3, **options))
+        >>> collector = GroupCollector(env, groups_per_batch=2, total_groups=4, group_size=3)  # random actions
+        >>> for batch in collector:
+        ...     print(batch.shape, rloo_advantage(batch["returns"][..., 0]).shape)
+        torch.Size([2, 3, 2]) torch.Size([2, 3])
+        torch.Size([2, 3, 2]) torch.Size([2, 3])
+        >>> collector.shutdown()
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        policy: TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase] | None = None,
+        *,
+        groups_per_batch: int,
+        total_groups: int = -1,
+        group_size: int | None = None,
+        max_decisions: int | None = None,
+        exploration_type: ExplorationType = ExplorationType.RANDOM,
+        exclude: Sequence[NestedKey] = (),
+    ) -> None:
+        super().__init__()
+        shape = tuple(env.batch_size)
+        if len(shape) == 1:
+            size = 1 if group_size is None else group_size
+            if size < 1 or shape[0] % size:
+                raise ValueError(f"group_size must divide the env's {shape[0]} rows, got {size}")
+            shape = (shape[0] // size, size)
+        elif len(shape) != 2 or group_size not in (None, shape[1]):
+            raise ValueError(f"env.batch_size must be [G, N] or [G * N] with group_size=N, got {list(env.batch_size)}")
+        if groups_per_batch < 1 or groups_per_batch % shape[0]:
+            raise ValueError(
+                f"groups_per_batch must be a multiple of the env's {shape[0]} groups, got {groups_per_batch}"
+            )
+        if total_groups != -1 and (total_groups < 1 or total_groups % groups_per_batch):
+            raise ValueError(f"total_groups must be -1 or a multiple of {groups_per_batch}, got {total_groups}")
+        if max_decisions is not None and max_decisions < 1:
+            raise ValueError(f"max_decisions must be at least 1, got {max_decisions}")
+        for module in policy.modules() if isinstance(policy, nn.Module) else ():
+            if isinstance(module, Policy):
+                check_pairing(module, env)
+        self.env, self.policy = env, policy
+        self.exclude = exclude
+        self.group_shape = shape
+        self.groups_per_batch, self.total_groups = groups_per_batch, total_groups
+        self.max_decisions = 10_000 if max_decisions is None else max_decisions
+        self.exploration_type = exploration_type
+        self._groups = self._frames = 0
+        self._iter = -1
+        self.closed = False
+
+    @property
+    def exclude(self) -> tuple[NestedKey, ...]:
+        """Entries of a step that rollouts leave out; assign it to change the batches that follow.
+
+        Images are nearly all of a rollout's memory, twice: an observation of step t is the next one of step t - 1.
+        What LOOP never reads: ``("frames", ("next", "frames"), ("next", "observation"))``.
+        """
+        return self._exclude
+
+    @exclude.setter
+    def exclude(self, names: Sequence[NestedKey]) -> None:
+        if isinstance(names, str):
+            raise ValueError(f"exclude must be a sequence of entries, got {names!r}: write [{names!r}]")
+        exclude = tuple(unravel_key(name) for name in names)
+        for name in exclude:
+            if name == "next" or name in _READ:
+                raise ValueError(f"exclude must leave reward and done flags in, got {name!r}")
+        self._exclude = exclude
+
+    def iterator(self) -> Iterator[TensorDictBase]:
+        while self.total_groups == -1 or self._groups < self.total_groups:
+            yield self._batch()
+
+    def __len__(self) -> int:
+        """Batches in all; raises ``RuntimeError`` for an endless collector."""
+        if self.total_groups == -1:
+            raise RuntimeError("this collector is endless (total_groups=-1): it has no length")
+        return self.total_groups // self.groups_per_batch
+
+    def _batch(self) -> TensorDictBase:
+        if self.closed:
+            raise RuntimeError("this collector was shut down: make a new one")
+        if self.pre_collect_hook is not None:
+            self.pre_collect_hook()
+        waves = [self._wave() for _ in range(self.groups_per_batch // self.group_shape[0])]
+        length = max(wave.shape[-1] for wave in waves)
+        batch = waves[0] if len(waves) == 1 else TensorDict.cat([_padded(wave, length) for wave in waves], 0)
+        self._groups += self.groups_per_batch
+        self._frames += int(batch[keys.MASK].sum())
+        self._iter += 1
+        if self.post_collect_hook is not None:
+            self.post_collect_hook(batch)
+        return batch
+
+    @torch.no_grad()
+    def _wave(self) -> TensorDictBase:
+        modules = list(self.policy.modules()) if isinstance(self.policy, nn.Module) else []
+        training = [module for module in modules if module.training]
+        try:
+            for module in training:
+                module.training = False
+            with set_exploration_type(self.exploration_type), _leaving_out(self.env, self.exclude):
+                rollout = self.env.rollout(
+                    self.max_decisions, self.policy, break_when_any_done=False, break_when_all_done=True
+                )
+        finally:
+            for module in training:
+                module.training = True
+        rollout = rollout.reshape(*self.group_shape, rollout.shape[-1])
+        done = rollout["next", "done"].squeeze(-1)  # [G, N, T]
+        # A finished row repeats its last entry, reward included: only what comes up to the first done belongs to it.
+        mask = (done.cumsum(-1) - done.long()) == 0
+        rollout[keys.MASK] = mask
+        rewards = rollout["next", "reward"].squeeze(-1)
+        rollout["returns"] = torch.where(mask, rewards, 0.0).sum(-1, keepdim=True).expand_as(rewards).contiguous()
+        return rollout
+
+    def update_policy_weights_(
+        self, policy_or_weights: Any = None, *, weights: Any = None, policy: nn.Module | None = None, **_: Any
+    ) -> None:
+        """Loads weights into the behaviour policy: a module, a state dict or a TensorDict of parameters.
+
+        Without an argument it does nothing: the collector calls the very policy it was given.
+        """
+        given = [source for source in (policy_or_weights, weights, policy) if source is not None]
+        if len(given) > 1:
+            raise ValueError("give the weights once: positionally, as weights=..., or as policy=...")
+        if not given or given[0] is self.policy:
+            return
+        if not isinstance(self.policy, nn.Module):
+            raise ValueError("the policy is a function: it has no weights to update")
+        if isinstance(given[0], TensorDictBase):
+            TensorDict.from_module(self.policy).data.update_(given[0].data)
+        else:
+            state = given[0].state_dict() if isinstance(given[0], nn.Module) else given[0]
+            self.policy.load_state_dict(state)
+
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        """Seeds the env and torch (the policy's samples); returns the env's next seed."""
+        torch.manual_seed(seed)
+        return self.env.set_seed(seed, static_seed=static_seed)
+
+    def state_dict(self) -> OrderedDict[str, Any]:
+        """Progress and the policy's weights."""
+        policy = self.policy.state_dict() if isinstance(self.policy, nn.Module) else {}
+        progress = {"groups": self._groups, "frames": self._frames, "iter": self._iter}
+        return OrderedDict(progress, policy_state_dict=policy)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self._groups, self._frames = int(state_dict["groups"]), int(state_dict["frames"])
+        self._iter = int(state_dict["iter"])
+        if isinstance(self.policy, nn.Module):
+            self.policy.load_state_dict(state_dict["policy_state_dict"])
+
+    def shutdown(self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True) -> None:
+        """Ends the collection and, unless told otherwise, closes the env."""
+        if self.closed:
+            return
+        self.closed = True
+        if close_env:  # is_closed is no guide: it is True from the start for envs that do not set it
+            self.env.close(raise_if_closed=False)
+
+
+@contextmanager
+def _leaving_out(env: EnvBase, names: tuple[NestedKey, ...]) -> Iterator[None]:
+    """While it lasts, rollouts of ``env`` drop these entries of a step once the next one has been prepared."""
+    if not names:
+        yield
+        return
+    # The hook by which TorchRL lets transient entries be dropped before steps are stacked.
+    before, own = env._post_step_mdp_hooks, "_post_step_mdp_hooks" in vars(env)
+
+    def drop(step: TensorDictBase, following: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        if before is not None:
+            step, following = before(step, following)
+        return step.exclude(*names), following
+
+    env._post_step_mdp_hooks = drop
+    try:
+        yield
+    finally:
+        del env._post_step_mdp_hooks  # the class's shows again
+        if own:
+            env._post_step_mdp_hooks = before
+
+
+def _padded(wave: TensorDictBase, length: int) -> TensorDictBase:
+    """``wave [G, N, T]`` extended to ``length`` by repeating its last entry, outside the mask."""
+    missing = length - wave.shape[-1]
+    if not missing:
+        return wave
+    tail = wave[..., -1:].expand(*wave.shape[:-1], missing).clone()
+    tail[keys.MASK] = torch.zeros_like(tail[keys.MASK])
+    return torch.cat([wave, tail], -1)

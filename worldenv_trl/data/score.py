@@ -1,0 +1,31 @@
+"""What a reflector makes of whole episodes."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from worldenv_trl.data.episodes import Episodes
+from worldenv_trl.reflectors import Reflector
+
+__all__ = ["score_episodes"]
+
+
+@torch.no_grad()
+def score_episodes(reflector: Reflector, episodes: Episodes, *, rows_at_once: int = 16) -> Tensor:
+    """R(o_1:t, g) of every frame, [R, T + 1]; past the end of an episode its last frame goes on.
+
+    Keyword Args:
+        rows_at_once: episodes whose frames are in memory at a time.
+    """
+    steps = torch.arange(1, episodes["actions"].shape[1] + 1)
+    parts = []
+    for start in range(0, len(episodes), rows_at_once):
+        rows = torch.arange(start, min(start + rows_at_once, len(episodes)))
+        first = {camera: episodes.frames(camera, rows, torch.zeros_like(rows)) for camera in reflector.cameras}
+        state = reflector.begin(first, [episodes.instructions[row] for row in rows.tolist()])
+        later = {camera: episodes.frames(camera, rows.unsqueeze(-1), steps) for camera in reflector.cameras}
+        start_score = state["score"].clone()
+        _, scores = reflector.extend(state, later)
+        parts.append(torch.cat([start_score.unsqueeze(-1), scores], 1))
+    return torch.cat(parts)

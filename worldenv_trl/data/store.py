@@ -1,0 +1,180 @@
+"""Episodes on disk: recordings read once into memory-mapped frames, which training then reads."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import itertools
+import json
+import os
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
+
+from worldenv_trl.data.episodes import Episodes, concatenated
+from worldenv_trl.data.from_rollouts import episodes_from_rollouts
+from worldenv_trl.keys import ACTION, CHUNK
+from worldenv_trl.record import list_rollouts, read_rollouts
+
+__all__ = ["FrameSink", "fill_store", "open_store", "release"]
+
+_MANIFEST = "episodes.json"
+_FORMAT = 1
+_AT_ONCE = 16  # rollouts in memory while a recording is read
+_DONTNEED = 4  # of madvise
+
+
+class FrameSink:
+    """Takes frames in order into a ReplayBuffer, on disk or in memory.
+
+    Args:
+        capacity: most frames.
+        folder: of the memory-mapped files; None keeps them in memory.
+    """
+
+    def __init__(self, capacity: int, folder: str | os.PathLike | None = None) -> None:
+        storage = LazyTensorStorage(capacity) if folder is None else LazyMemmapStorage(capacity, scratch_dir=folder)
+        self.buffer = ReplayBuffer(storage=storage, batch_size=1)
+        self._on_disk = folder is not None
+
+    def add(self, frames: TensorDictBase) -> None:
+        """``frames`` [n] behind those that are there."""
+        self.buffer.extend(frames)
+        if self._on_disk:
+            release(self.frames)
+
+    @property
+    def frames(self) -> TensorDictBase:
+        """All frames [F] so far, not copied."""
+        return self.buffer.storage.get(slice(None))
+
+
+def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike]) -> list[Episodes]:
+    """Reads ``recordings`` (MCAP) into ``folder``, which is replaced, and opens it; see :func:`open_store`.
+
+    Small entries are kept beside the frames. Only some rollouts are in memory at a time.
+
+    Raises:
+        ValueError: for recordings that cannot be made into episodes, or of different cameras or sizes.
+        OSError: if the disk has no room for the frames.
+    """
+    folder = Path(folder)
+    partial = folder.with_name(folder.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    sink: FrameSink | None = None
+    entries: list[TensorDict] = []
+    texts: list[str] = []
+    infos = {path: list_rollouts(path) for path in recordings}
+    capacity = sum(
+        _steps_per_entry(path) * sum(info.length for info in each) + len(each) for path, each in infos.items() if each
+    )
+    for part in (part for path, each in infos.items() for part in _parts(path, len(each))):
+        frames, _ = part.video
+        if sink is None:
+            _check_room(partial, capacity, frames)
+            sink = FrameSink(capacity, partial / "frames")
+        sink.add(frames)
+        entries.append(part.entries)
+        texts += part.instructions
+    if sink is None:
+        raise ValueError(f"there are no rollouts in {', '.join(map(str, recordings)) or 'no recordings'}")
+    concatenated(entries).memmap(partial / "entries")
+    distinct = sorted(set(texts))
+    manifest = {
+        "format": _FORMAT,
+        "recordings": [_identity(path) for path in recordings],
+        "counts": [len(each) for each in infos.values()],
+        "frames": len(sink.frames),
+        "instructions": distinct,
+        "instruction": [distinct.index(text) for text in texts],
+    }
+    # Last: a store without its manifest is not finished.
+    (partial / _MANIFEST).write_text(json.dumps(manifest))
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(partial, folder)
+    return open_store(folder, recordings)
+
+
+def open_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike]) -> list[Episodes]:
+    """The episodes of each of ``recordings`` that :func:`fill_store` left in ``folder``; all share one set of frames.
+
+    Raises:
+        FileNotFoundError: if there is no store, or a recording is gone.
+        ValueError: for a store of other recordings or another format, or one that was cut short; :func:`fill_store`
+            makes it anew from the recordings, which are the record.
+    """
+    folder = Path(folder)
+    remedy = "fill_store makes it anew from the recordings"
+    if not (folder / _MANIFEST).is_file():
+        raise FileNotFoundError(f"no episode store at {folder}: {remedy}")
+    try:
+        manifest = json.loads((folder / _MANIFEST).read_text())
+        if manifest["format"] != _FORMAT:
+            raise ValueError(f"the episode store {folder} has format {manifest['format']}, not {_FORMAT}: {remedy}")
+        held, wanted = manifest["recordings"], [_identity(path) for path in recordings]
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"the episode store {folder} is cut short ({error!r}): {remedy}") from error
+    if held != wanted:
+        names = [", ".join(each["name"] for each in side) for side in (held, wanted)]
+        changed = " as they were before they changed" if names[0] == names[1] else ""
+        raise ValueError(
+            f"the episode store {folder} belongs to other recordings, {names[0]}{changed}, not {names[1]}: {remedy}"
+        )
+    try:
+        frames = TensorDict.load_memmap(folder / "frames")[: manifest["frames"]]
+        entries = TensorDict.load_memmap(folder / "entries").clone()
+        texts = [manifest["instructions"][index] for index in manifest["instruction"]]
+        episodes = Episodes(entries, texts, frames)
+        ends = torch.tensor([0, *manifest["counts"]]).cumsum(0).tolist()
+        return [episodes[start:end] for start, end in itertools.pairwise(ends)]
+    except (OSError, RuntimeError, KeyError, IndexError, ValueError) as error:
+        raise ValueError(f"the episode store {folder} is cut short or damaged ({error}): {remedy}") from error
+
+
+def release(frames: TensorDictBase) -> None:
+    """Lets the system take back the memory that shows files of memory-mapped ``frames``; they are read again if needed.
+
+    Does nothing for tensors in memory, nor where there is no ``madvise``.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    libc = ctypes.CDLL(None)
+    for value in frames.values(True, True):
+        storage = value.untyped_storage()
+        if storage.filename:  # never memory that no file stands behind
+            libc.madvise(ctypes.c_void_p(storage.data_ptr()), ctypes.c_size_t(storage.nbytes()), _DONTNEED)
+
+
+def _parts(path: str | os.PathLike, count: int) -> Iterator[Episodes]:
+    for start in range(0, count, _AT_ONCE):
+        yield episodes_from_rollouts(read_rollouts(path, rollouts=slice(start, start + _AT_ONCE)))
+
+
+def _steps_per_entry(path: str | os.PathLike) -> int:
+    """1, or the chunk length of a recording of decisions."""
+    one = read_rollouts(path, rollouts=[0])
+    return 1 if one.get(ACTION, None) is not None else one[CHUNK].shape[-2]
+
+
+def _check_room(folder: Path, count: int, frames: TensorDictBase) -> None:
+    need = count * sum(value[0].numel() for value in frames.values(True, True))
+    free = shutil.disk_usage(folder).free
+    if need > free:
+        raise OSError(f"the frames of the episodes take {need / 1e9:.1f} GB, {folder} has {free / 1e9:.1f} GB free")
+
+
+def _identity(path: str | os.PathLike) -> dict[str, str | int]:
+    """What a recording is recognised by: its name, size and ends, where MCAP keeps its header and its index."""
+    path = Path(path)
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        digest = hashlib.sha256(file.read(1 << 16))
+        file.seek(max(0, size - (1 << 20)))
+        digest.update(file.read())
+    return {"name": path.name, "bytes": size, "sha256": digest.hexdigest()}

@@ -1,0 +1,64 @@
+"""Keeps the frames of a wave out of its TensorDict."""
+
+from __future__ import annotations
+
+import tempfile
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Composite
+from torchrl.envs.transforms import Transform
+
+from worldenv_trl.keys import FRAMES
+
+__all__ = ["FramesAside"]
+
+
+class FramesAside(Transform):
+    """Takes ``frames`` out of what a decision-level env writes; on request they go to a file instead.
+
+    A rollout carries every entry of the env twice, as ``next`` and as the root of the step after, and LOOP reads none
+    of the frames between decisions: at 128 px, two cameras and 192 rows they would be nearly 3 GB a wave. Goes around
+    the transforms that read frames (:class:`~worldenv_trl.envs.Reflect`).
+
+    :attr:`keep` may be set before a wave begins; then :meth:`frames` gives them afterwards.
+
+    Examples:
+        >>> aside = FramesAside()
+        >>> aside.keep = True
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.keep = False
+        self._folder: tempfile.TemporaryDirectory | None = None
+        self._decisions: list[TensorDictBase] = []
+
+    def frames(self) -> TensorDict:
+        """``("frames", entry)`` uint8 [*B, D, C, 3, H, W] of the D decisions since the reset, from their files.
+
+        Raises:
+            RuntimeError: if :attr:`keep` was not set when they were made.
+        """
+        if not self._decisions:
+            raise RuntimeError("no frames were kept: set keep to True before the env is reset")
+        return torch.stack(self._decisions, -1)
+
+    def _reset(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None or bool(mask.all()):
+            self._decisions = []
+            if self._folder is not None:
+                self._folder.cleanup()
+            self._folder = tempfile.TemporaryDirectory() if self.keep else None
+        return tensordict_reset.exclude(FRAMES)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if self._folder is not None:
+            shown = next_tensordict.select(FRAMES)
+            self._decisions.append(shown.memmap(f"{self._folder.name}/{len(self._decisions)}"))
+        return next_tensordict.exclude(FRAMES)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        del observation_spec[FRAMES]
+        return observation_spec
