@@ -78,6 +78,7 @@ class ChunkedActions(MultiAction):
         active = (
             torch.ones(parent.batch_size, dtype=torch.bool) if active is None else active.reshape(parent.batch_size)
         )
+        self._active: torch.Tensor = active
         self._executed: list[torch.Tensor] = []
         self._shown: dict = {source: [] for source in self._per_step(parent.observation_spec).values()}
         self._reward: torch.Tensor | None = None
