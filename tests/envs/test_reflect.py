@@ -124,6 +124,15 @@ def test_a_rule_may_be_assigned_while_the_rollout_runs_and_stopping_switched_off
     assert reflect.rule == StopRule(0.5, 2) and "consecutive=2" in repr(reflect)
 
 
+def test_a_row_that_is_reset_begins_to_count_anew():
+    env = reflected([[10, 10, 10, 250, 10, 10, 10, 10]], StopRule(0.5, 2))
+    td = step_mdp(env.step(env.reset().set(keys.CHUNK, torch.zeros(1, 4, 7))))
+    env.base_env.films["agentview"][:, 1, 0, 0, 0] = 250
+    td["_reset"] = torch.ones(1, 1, dtype=torch.bool)
+    td = env.step(env.reset(td).set(keys.CHUNK, torch.zeros(1, 4, 7)))
+    assert td["next", keys.STEP_MASK].all() and not td["next", "done"].any()
+
+
 # ------------------------------------------------------------------------------------------------- states
 
 
@@ -291,10 +300,11 @@ def test_over_the_physics_a_stop_leaves_the_rest_of_the_chunk_unexecuted(physics
 
 
 def test_a_rule_that_is_assigned_counts_inside_chunks_of_the_physics(physics):
-    env = physics(1, StopRule(0.95), around=lambda env: chunked(env, 4))
+    stepped = physics(1, StopRule(0.95))
+    env = chunked(stepped, 4)
     td = env.step(env.reset().set(keys.CHUNK, torch.zeros(1, 4, 7)))
     assert td["next", keys.STEP_MASK].all()
-    env.transform[0].rule = StopRule(0.65)
+    stepped.transform.rule = StopRule(0.65)
     td = env.step(step_mdp(td).set(keys.CHUNK, torch.zeros(1, 4, 7)))
     assert td["next", keys.STEP_MASK].tolist() == [[True, True, False, False]]
 

@@ -89,11 +89,12 @@ def test_videos_of_different_lengths_are_extended_together_as_they_would_be_alon
         torch.testing.assert_close(scores[row], expected[row, start - 1 : start + 3])
 
 
-def test_padding_frames_do_not_reach_the_score(reflector):
+@pytest.mark.parametrize("length", [1, 3])
+def test_padding_frames_do_not_reach_the_score(reflector, length):
     features, query = torch.randn(1, 6, 96), torch.randn(1, 96)
     spoilt = features.clone()
-    spoilt[:, 3:] = 1e3
-    lengths = torch.tensor([3])
+    spoilt[:, length:] = torch.randn(6 - length, 96)
+    lengths = torch.tensor([length])
     torch.testing.assert_close(reflector.logits(features, lengths, query), reflector.logits(spoilt, lengths, query))
 
 

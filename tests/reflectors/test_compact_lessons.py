@@ -73,6 +73,25 @@ def test_frames_are_read_as_they_are_drawn_and_in_parts():
     assert training.most_frames <= 16 * 9
 
 
+def test_a_frame_and_the_first_of_its_video_are_moved_alike():
+    film = torch.zeros(4, 3, 3, 16, 16, dtype=torch.uint8)
+    film[..., 5:8, 8:11] = 250
+    data = Videos({"agentview": film}, [SIDES[0]] * 4, torch.tensor([[False, False, True]] * 4))
+    lesson, moves = next(make(batch_size=8).train_on(data)), set()
+    for _ in range(20):
+        batch = lesson.sample()
+        places = set()
+        for name in ("frames", "first"):
+            bright = (batch[name, "image"][:, 0] - 60).clamp(min=0)  # [P, 16, 16]
+            weight = bright.sum((1, 2))
+            row, column = ((bright.sum(dim) * torch.arange(16)).sum(1) / weight for dim in (2, 1))
+            places |= set(zip(row.round().int().tolist(), column.round().int().tolist(), strict=True))
+        assert len(places) == 1
+        moves |= places
+    assert {row for row, _ in moves} <= set(range(4, 9)) and {column for _, column in moves} <= set(range(7, 12))
+    assert len(moves) > 5
+
+
 def test_two_cameras_are_trained_on():
     one = patches(16, SIDES)
     both = Videos(
