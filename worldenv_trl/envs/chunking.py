@@ -40,6 +40,10 @@ class ChunkedEnv(TransformedEnv):
     def chunk_length(self) -> int:
         return next(part.chunk_length for part in _parts(self.transform) if isinstance(part, ChunkedActions))
 
+    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        """A random chunk, also around an env with transforms, of which TorchRL asks a random step."""
+        return EnvBase.rand_action(self, tensordict)
+
 
 def _parts(transform: Transform) -> list[Transform]:
     return list(transform) if isinstance(transform, Compose) else [transform]
@@ -78,6 +82,7 @@ class ChunkedActions(MultiAction):
         active = (
             torch.ones(parent.batch_size, dtype=torch.bool) if active is None else active.reshape(parent.batch_size)
         )
+        self._active: torch.Tensor = active
         self._executed: list[torch.Tensor] = []
         self._shown: dict = {source: [] for source in self._per_step(parent.observation_spec).values()}
         self._reward: torch.Tensor | None = None

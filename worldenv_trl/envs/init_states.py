@@ -69,7 +69,8 @@ class InitStates:
         self.seed(0)
 
     def seed(self, seed: int) -> None:
-        self._seed, self._orders = seed, {}
+        self._seed = seed
+        self._orders: dict[int, np.ndarray] = {}  # of each pass over the states
 
     def draw(self, number: int) -> tuple[int, np.ndarray]:
         """Context id and state ``[S]`` of the task's ``number``-th episode: a function of seed and number only."""

@@ -22,9 +22,9 @@ _LARGEST_ID = 2**31 - 1  # context ids, a hundred thousand times that, still fit
 
 def check_whole(name: str, value: object, low: int, high: int | None = None, why: str = "") -> None:
     """Raises ``ValueError`` unless ``value`` is a whole number from ``low`` to ``high``; ``why`` explains ``high``."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
+    if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < low:
         raise ValueError(f"{name} must be a whole number of at least {low}, got {value!r}")
-    if high is not None and value > high:
+    if high is not None and int(value) > high:
         raise ValueError(f"{name} must be at most {high}, got {value}{why and f': {why}'}")
 
 

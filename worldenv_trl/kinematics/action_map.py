@@ -53,6 +53,12 @@ class ActionMap(nn.Module):
     """
 
     channels = 6
+    _position: Tensor  # [cameras, 3]
+    _rotation: Tensor  # [cameras, 3, 3]
+    _on_tool: Tensor  # [cameras]
+    _focal: Tensor  # [cameras], pixels
+    _column: Tensor  # [W]
+    _row: Tensor  # [H]
 
     def __init__(
         self,

@@ -33,6 +33,12 @@ class ForwardKinematics(nn.Module):
         (torch.Size([2, 20]), torch.Size([2, 8, 20]))
     """
 
+    _joint_low: Tensor
+    _joint_high: Tensor
+    _workspace_low: Tensor
+    _workspace_high: Tensor
+    _damping: Tensor
+
     def __init__(self, *, damping: float = panda.DLS_DAMPING) -> None:
         super().__init__()
         chain = pk.build_chain_from_urdf(panda.urdf().encode())

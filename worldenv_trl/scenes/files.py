@@ -26,7 +26,7 @@ __all__ = ["FileTask", "load_bddl"]
 MAX_STEPS = 300  # LIBERO's goal suite, in openvla-oft's protocol
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FileTask(Task):
     """A task whose scene, initial states and goal come from a file.
 
@@ -36,7 +36,7 @@ class FileTask(Task):
     """
 
     states: Path | None = None
-    problem: Problem | None = field(default=None, compare=False, repr=False)
+    problem: Problem = field(compare=False, repr=False)
 
     def build(self) -> mujoco.MjModel:
         return _scene(self)[1]

@@ -41,19 +41,15 @@ class Panda(composer.Entity):
         self._root.default.geom.set_attributes(contype=0, conaffinity=0, mass=0.0, rgba=(0.86, 0.87, 0.9, 1))
         body = self._root.worldbody.add("body", name="base", gravcomp=1)
         body.add("geom", type="capsule", fromto=(0, 0, 0.02, 0, 0, 0.13), size=(0.07,))
-        self._joints = []
         for joint, (start, end, radius), torque in zip(JOINTS, _LINKS, _TORQUE_LIMITS, strict=True):
             # Only single-axis angles occur here, so URDF's roll, pitch, yaw and MuJoCo's Euler angles read the same.
             body = body.add(
                 "body", name=joint.name.replace("joint", "link"), pos=joint.xyz, euler=joint.rpy, gravcomp=1
             )
             body.add("inertial", pos=joint.com, mass=joint.mass, fullinertia=joint.inertia)
-            self._joints.append(
-                body.add(
-                    "joint", name=joint.name, type="hinge", axis=(0, 0, 1), range=(joint.lower, joint.upper),
-                    limited=True, damping=1.0, armature=0.1, actuatorfrclimited=True,
-                    actuatorfrcrange=(-torque, torque),
-                )
+            body.add(
+                "joint", name=joint.name, type="hinge", axis=(0, 0, 1), range=(joint.lower, joint.upper), limited=True,
+                damping=1.0, armature=0.1, actuatorfrclimited=True, actuatorfrcrange=(-torque, torque),
             )  # fmt: skip
             body.add("geom", type="capsule", fromto=(*start, *end), size=(radius,))
         hand = body.add("body", name="hand", pos=(0, 0, HAND_OFFSET), euler=(0, 0, HAND_YAW), gravcomp=1)

@@ -15,7 +15,15 @@ from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import ExpertPolicy, ImaginedEnv, Reflect, TabletopEnv
 from worldenv_trl.kinematics import ForwardKinematics
-from worldenv_trl.record import RolloutWriter, provenance, read_metadata, read_rollouts, recorded, replay
+from worldenv_trl.record import (
+    RolloutWriter,
+    provenance,
+    read_attachments,
+    read_metadata,
+    read_rollouts,
+    recorded,
+    replay,
+)
 from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.world_models import WorldModel
 
@@ -126,6 +134,28 @@ def test_every_camera_of_the_model_is_replayed_and_compared(tmp_path):
     late = replay(tmp_path / "a.mcap", 1, world_model=Painter(7, cameras=model.cameras), from_step=8, write=False)
     assert [step for step, value in late.psnr.items() if value == float("inf")] == list(range(9))
     assert {each.field for each in late.divergences} == {"image", "wrist_image"}
+
+
+def test_a_recording_without_frames_is_replayed_by_what_it_shows(tmp_path):
+    model = Painter()
+    wave = imagine(tmp_path / "a.mcap", model)
+    about = {"metadata": read_metadata(tmp_path / "a.mcap"), "attachments": read_attachments(tmp_path / "a.mcap")}
+    with RolloutWriter(tmp_path / "b.mcap", **about) as writer:
+        writer.write(wave.exclude(keys.FRAMES, ("next", keys.FRAMES)))
+    report = replay(tmp_path / "b.mcap", 1, world_model=model)
+    assert report.exact is True and list(report.psnr) == [0, 4, 8, 12, 16]
+    played = read_rollouts(report.target)[0]
+    shown = played["next", "recorded", *FRAMES]
+    assert torch.equal(shown[:, -1], wave.reshape(-1, 4)["next", "observation", "image"][1])
+    late = replay(tmp_path / "b.mcap", 1, world_model=Painter(7), edits={9: {6: 1.0}}, write=False)
+    assert late.first.step == 10
+
+
+def test_a_policy_of_another_chunk_length_is_refused(tmp_path):
+    imagine(tmp_path / "a.mcap", Painter(), steps=4)
+    policy = TensorDictModule(lambda steps: torch.zeros(*steps.shape[:-1], C + 1, 7), [keys.NUM_STEPS], [keys.CHUNK])
+    with pytest.raises(ValueError, match="the policy's chunks have 5 actions, the world model's 4"):
+        replay(tmp_path / "a.mcap", world_model=Painter(), policy=policy, write=False)
 
 
 def test_a_model_of_a_camera_that_was_not_recorded_is_refused(tmp_path):

@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from worldenv_trl.keys import ACTION_DIM, CHUNK
@@ -63,6 +64,16 @@ class Branch:
                 for dimension, value in values.items():
                     out[step - first, dimension] = value
         return out
+
+    def check_policy(self, env: EnvBase) -> None:
+        """Raises ``ValueError`` if the policy was not trained for what ``env`` shows and executes."""
+        if not isinstance(self.policy, nn.Module):
+            return
+        from worldenv_trl.policies import Policy, check_pairing  # reading needs no policies
+
+        for part in self.policy.modules():
+            if isinstance(part, Policy):
+                check_pairing(part, env)
 
     @torch.no_grad()
     def decide(self, tensordict: TensorDictBase) -> Tensor:

@@ -79,6 +79,8 @@ def replay_imagination(
     )
     reflect = None if reflector is None else Reflect(reflector, rule)
     env = env if reflect is None else TransformedEnv(env, reflect)
+    if branch is not None:
+        branch.check_policy(env)
     td = env.reset(contexts.reshape(env.batch_size), set_state=True)
     if branch is not None and branch.seed is not None:
         torch.manual_seed(branch.seed)
@@ -89,7 +91,10 @@ def replay_imagination(
         if branch is not None:  # it is at a whole decision
             branch.direct(reflect, rule, branch.step if behind else -1)
         if behind and branch.policy is not None:
-            chunk, rows = branch.decide(td).reshape(count, length, ACTION_DIM), torch.ones(count, dtype=torch.bool)
+            chunk, rows = branch.decide(td), torch.ones(count, dtype=torch.bool)
+            if chunk.shape[-2] != length:
+                raise ValueError(f"the policy's chunks have {chunk.shape[-2]} actions, the world model's {length}")
+            chunk = chunk.reshape(count, length, ACTION_DIM)
         else:
             chunk, rows = chunks[:, decision], active[:, decision]
         if branch is not None and branch.edits:

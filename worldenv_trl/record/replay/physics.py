@@ -41,6 +41,8 @@ def replay_physics(
         reflect = Reflect(reflector, rule)
         env = TransformedEnv(env, reflect)
     try:
+        if branch is not None:
+            branch.check_policy(env)
         start, first = _start(source, base, from_step, notes)
         td = env.reset(start, set_state=True)
         if reflect is not None and first:

@@ -301,7 +301,7 @@ def _write(source, played: TensorDict, report: ReplayReport, recorded, target: P
         steps, images = recorded[name]
         chunk = played["next", FRAMES, name].shape[1] if ("next", FRAMES, name) in have else 1
         shown = report.first_step + 1 + torch.arange(len(played) * chunk)  # the steps of the played images
-        place = torch.searchsorted(steps, shown).clamp(max=len(images) - 1)
+        place = (torch.searchsorted(steps, shown, right=True) - 1).clamp(min=0)  # the last one that is known
         shape = (len(played),) if chunk == 1 else (len(played), chunk)
         key = (name,) if chunk == 1 else (FRAMES, name)
         played["next", "recorded", *key] = images[place].reshape(*shape, *images.shape[1:])
