@@ -159,6 +159,7 @@ def test_a_patch_of_8_at_128_px_has_the_trunk_of_a_patch_of_4_at_64_px():
     ("settings", "message"),
     [
         ({"image_size": 40}, "image_size must be a multiple of 16"),
+        ({"patch": 4}, "patch must leave at least 16 cells a side, got 4 px of 32 px images"),
         ({"num_denoise_steps": 9}, "between 1 and 4, got 9"),
         ({"memory_stride": 9}, "memory_stride must lie between 1 and chunk_length=8, got 9"),
         ({"blocks": (1,)}, "equally long"),

@@ -81,6 +81,10 @@ class VideoWorldModelConfig:
             raise ValueError(
                 f"image_size must be a multiple of {max(16, grid)} and at least 32 px, got {self.image_size}"
             )
+        if self.image_size // self.patch < 16:
+            raise ValueError(
+                f"patch must leave at least 16 cells a side, got {self.patch} px of {self.image_size} px images"
+            )
         if not 1 <= self.memory_stride <= self.chunk_length:
             raise ValueError(
                 f"memory_stride must lie between 1 and chunk_length={self.chunk_length}, got {self.memory_stride}"
