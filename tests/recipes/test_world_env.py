@@ -11,8 +11,7 @@ import torch
 
 import world_env
 from checks import check_config
-from config import GOAL_TASKS, PRESETS, Demonstrate, Evaluate, Explore, PostTrain, Reflector, WorldModel
-from config import SFT as SFTConfig
+from config import GOAL_TASKS, PRESETS, Demonstrate, Explore, PostTrain, WorldModel
 from imagination import read_contexts
 from run import Run
 from run_folder import RunFolder
@@ -22,25 +21,6 @@ from world_env import run_all
 from worldenv_trl import keys
 from worldenv_trl.envs import context_id
 from worldenv_trl.record import read_rollouts
-
-
-@pytest.fixture
-def tiny(tmp_path):
-    return dataclasses.replace(
-        PRESETS["smoke"][1],
-        run_dir=tmp_path / "run",
-        num_threads=1,
-        tasks=GOAL_TASKS[1:2],
-        max_steps=16,
-        train_states=4,
-        demonstrate=Demonstrate(episodes_per_task=1),
-        sft=SFTConfig(steps=3, scale_steps=2),
-        explore=Explore(episodes_per_task=8, num_envs=4, scale_factors=(1.0,)),
-        world_model=WorldModel(steps=2, batch_size=2),
-        reflector=Reflector(encoder_steps=2, steps=2, batch_size=4),
-        post_train=PostTrain(iterations=1, groups=2, group_size=2, epochs=1, probe_contexts=2),
-        evaluate=Evaluate(episodes_per_task=2, num_envs=2),
-    )
 
 
 def test_presets_parse_and_single_settings_are_overridden():
