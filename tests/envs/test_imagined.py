@@ -1,19 +1,19 @@
-"""ImaginedEnv against a world model whose frames are known in closed form."""
+"""ImaginedEnv against a world model whose frames are known in closed form: resets, steps and ends."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import NonTensorStack, TensorDict
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from imagined_worlds import FK, SIZE, TWO, C, CountingWorldModel, given, make_contexts, make_env, with_chunk
+from tensordict.nn import TensorDictModule
 from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from worldenv_trl import keys
 from worldenv_trl.envs import ImaginedEnv, TabletopEnv, chunked
 from worldenv_trl.keys import (
     CHUNK,
     CONTEXT_ID,
-    FRAMES,
     IMAGE,
     INSTRUCTION,
     KINEMATIC_STATE,
@@ -25,77 +25,27 @@ from worldenv_trl.keys import (
     STEP_MASK,
     SUCCESS,
     TASK_ID,
+    WRIST_IMAGE,
 )
-from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.record import read_rollouts, recorded
-from worldenv_trl.robot import panda
 from worldenv_trl.scenes import list_tasks
 
-SIZE, C = 16, 4
-FK = ForwardKinematics()
-
-
-class CountingWorldModel(TensorDictModuleBase):
-    """Red counts the frames, green is noise of the row's seed, blue the newest remembered red. Keeps its requests."""
-
-    in_keys = [("memory", "frames"), "poses", "noise_seed"]  # noqa: RUF012
-    out_keys = [FRAMES]  # noqa: RUF012
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.requests: list[TensorDict] = []
-
-    def memory_indices(self, t: torch.Tensor) -> torch.Tensor:
-        return torch.stack([t // 2, t], -1)
-
-    def forward(self, tensordict: TensorDict) -> TensorDict:
-        self.requests.append(tensordict.clone())
-        newest = tensordict["memory", "frames"][:, -1, 0, 0, 0].long()
-        frames = torch.zeros(*tensordict.shape, C, 3, SIZE, SIZE, dtype=torch.uint8)
-        frames[:, :, 0] = (newest[:, None] + torch.arange(1, C + 1)).to(torch.uint8)[..., None, None]
-        for row, seed in enumerate(tensordict["noise_seed"].flatten().tolist()):
-            generator = torch.Generator().manual_seed(seed)
-            frames[row, :, 1] = torch.randint(256, (C, SIZE, SIZE), generator=generator, dtype=torch.uint8)
-        frames[:, :, 2] = newest.to(torch.uint8)[:, None, None, None]
-        return tensordict.set(FRAMES, frames)
-
-
-def make_contexts(count: int = 5) -> TensorDict:
-    generator = torch.Generator().manual_seed(3)
-    q = torch.as_tensor(panda.HOME_Q, dtype=torch.float32) + 0.05 * torch.randn(count, 7, generator=generator)
-    kinematic_state = FK.initial_state(q)
-    images = torch.randint(256, (count, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
-    images[:, 0] = (10 * torch.arange(count, dtype=torch.uint8))[:, None, None]
-    contexts = TensorDict(
-        {
-            "observation": {"image": images, "state": FK.state(kinematic_state, "commanded")},
-            KINEMATIC_STATE: kinematic_state,
-            TASK_ID: torch.arange(count)[:, None] % 2,
-            CONTEXT_ID: 100 + torch.arange(count)[:, None],
-        },
-        batch_size=[count],
-    )
-    contexts.set(INSTRUCTION, NonTensorStack(*["push" if i % 2 else "pull" for i in range(count)]))
-    return contexts
-
-
-def make_env(groups: int = 2, rollouts: int = 3, *, count: int = 5, **kwargs) -> ImaginedEnv:
-    kwargs = {"max_steps": 3 * C, "seed": 0, "chunk_length": C} | kwargs
-    return ImaginedEnv(CountingWorldModel(), FK, make_contexts(count), [groups, rollouts], **kwargs)
-
-
-def with_chunk(td: TensorDict, scale: float = 0.5, seed: int = 1) -> TensorDict:
-    chunk = scale * torch.randn(*td.shape, C, 7, generator=torch.Generator().manual_seed(seed))
-    return td.set(CHUNK, chunk)
-
-
-def given(env: ImaginedEnv, picks: list[list[int]]) -> TensorDict:
-    return make_contexts()[torch.tensor(picks)].reshape(env.batch_size)
+FRAMES = keys.frames_key("agentview")
+WRIST_FRAMES = keys.frames_key("wrist")
 
 
 @pytest.mark.parametrize("proprio", ["commanded", "measured"])
 def test_specs_hold(proprio):
     check_env_specs(make_env(proprio=proprio), seed=0)
+
+
+@pytest.mark.parametrize("cameras", [["agentview"], ["wrist"], ["wrist", "from the left", "agentview"]])
+def test_specs_hold_for_any_cameras(cameras):
+    env = make_env(world_model=CountingWorldModel(cameras))
+    check_env_specs(env, seed=0)
+    assert env.cameras == tuple(cameras) and env.image_size == SIZE
+    entries = {keys.image_entry(camera) for camera in cameras}
+    assert set(env.reset()["observation"].keys()) == {*entries, "state"}
 
 
 def test_specs_hold_when_the_last_chunk_is_cut():
@@ -106,13 +56,16 @@ def test_specs_hold_under_transforms():
     check_env_specs(TransformedEnv(make_env(), StepCounter()), seed=0)
 
 
+# -------------------------------------------------------------------------------------------------------- resets
+
+
 def test_a_reset_repeats_each_context_over_its_group_and_shows_it_exactly():
     td = make_env().reset()
     contexts = make_contexts()
     for group in range(2):
         index = int(td[CONTEXT_ID][group, 0]) - 100
         for rollout in range(3):
-            for key in (IMAGE, STATE, KINEMATIC_STATE, TASK_ID, CONTEXT_ID):
+            for key in (IMAGE, WRIST_IMAGE, STATE, KINEMATIC_STATE, TASK_ID, CONTEXT_ID):
                 assert torch.equal(td[key][group, rollout], contexts[key][index])
             assert td[INSTRUCTION][group][rollout] == contexts[INSTRUCTION][index]
     assert not td[STEP_MASK].any() and not td[NUM_STEPS].any() and not td["done"].any()
@@ -152,6 +105,78 @@ def test_the_seed_decides_contexts_and_noise():
     assert torch.equal(env.step(with_chunk(env.reset()))["next", FRAMES], first[0][FRAMES])
 
 
+def test_a_row_reset_alone_restarts_the_context_of_its_group():
+    env = make_env()
+    start = env.reset()
+    td = env.step(with_chunk(start.clone()))["next"]
+    reset = torch.zeros(2, 3, 1, dtype=torch.bool)
+    reset[1, 2] = True
+    again = env.reset(td.clone().set("_reset", reset), set_state=False)
+    for key in (IMAGE, WRIST_IMAGE, STATE, KINEMATIC_STATE, CONTEXT_ID, NUM_STEPS):
+        assert torch.equal(again[key][1, 2], start[key][1, 2]), key
+        assert torch.equal(again[key][0], td[key][0]), key
+    after = env.step(with_chunk(again))["next"]
+    assert after[NUM_STEPS].flatten().tolist() == [2 * C] * 5 + [C]
+
+
+def test_a_row_reset_alone_begins_its_video_anew():
+    env = make_env()
+    start = env.reset()
+    td = env.step(with_chunk(start.clone()))["next"]
+    reset = torch.zeros(2, 3, 1, dtype=torch.bool)
+    reset[1, 2] = True
+    env.step(with_chunk(env.reset(td.set("_reset", reset), set_state=False)))
+    asked = env.world_model.requests[-1]["memory", "frames", "wrist_image"].unflatten(0, (2, 3))
+    assert torch.equal(asked[1, 2], start[WRIST_IMAGE][1, 2].expand(2, -1, -1, -1))
+
+
+def test_a_group_reset_as_a_whole_gets_the_next_context():
+    env = make_env()
+    start = env.reset()
+    reset = torch.zeros(2, 3, 1, dtype=torch.bool)
+    reset[1] = True
+    again = env.reset(start.clone().set("_reset", reset), set_state=False)
+    seen = set(start[CONTEXT_ID].flatten().tolist())
+    assert torch.equal(again[CONTEXT_ID][0], start[CONTEXT_ID][0])
+    assert len(set(again[CONTEXT_ID][1].flatten().tolist())) == 1 and int(again[CONTEXT_ID][1, 0]) not in seen
+
+
+def test_given_contexts_are_where_rollouts_begin():
+    env = make_env()
+    picks = [[4, 0, 2], [1, 1, 3]]
+    td = env.reset(given(env, picks), set_state=True)
+    assert (td[CONTEXT_ID].squeeze(-1) - 100).tolist() == picks
+    for key in (IMAGE, WRIST_IMAGE, STATE, KINEMATIC_STATE, TASK_ID):
+        assert torch.equal(td[key], make_contexts()[key][torch.tensor(picks)]), key
+    texts = [["push" if pick % 2 else "pull" for pick in row] for row in picks]
+    assert [[td[INSTRUCTION][g][n] for n in range(3)] for g in range(2)] == texts
+
+
+def test_given_contexts_without_a_goal_get_that_of_their_task():
+    env = make_env(1, 2)
+    td = env.reset(given(env, [[3, 2]]).exclude(INSTRUCTION), set_state=True)
+    assert td[INSTRUCTION][0][0] == "push" and td[INSTRUCTION][0][1] == "pull"
+
+
+def test_given_contexts_are_put_into_the_rows_that_are_reset():
+    env = make_env()
+    td = env.step(with_chunk(env.reset()))["next"]
+    reset = torch.zeros(2, 3, dtype=torch.bool)
+    reset[0, 1] = reset[1, 0] = True
+    start, new = td.exclude(INSTRUCTION).clone(), given(env, [[4] * 3, [4] * 3])
+    for key in (IMAGE, WRIST_IMAGE, STATE, KINEMATIC_STATE, TASK_ID, CONTEXT_ID):
+        start[key][reset] = new[key][reset]
+    again = env.reset(start.set("_reset", reset.unsqueeze(-1)), set_state=True)
+    assert torch.equal(again[CONTEXT_ID].squeeze(-1) == 104, reset | (td[CONTEXT_ID].squeeze(-1) == 104))
+    after = env.step(with_chunk(again, seed=2))["next"]
+    assert torch.equal(after[NUM_STEPS].squeeze(-1), torch.where(reset, C, 2 * C))
+    now = torch.where(reset, 40, td[IMAGE][:, :, 0, 0, 0].long())  # red of the fifth context is 40
+    assert torch.equal(after[FRAMES][:, :, 0, 0, 0, 0].long(), now + 1)
+
+
+# --------------------------------------------------------------------------------------------------------- steps
+
+
 def test_states_are_the_forward_kinematics_of_the_clipped_chunk():
     env = make_env()
     td = with_chunk(env.reset(), scale=3.0)
@@ -166,56 +191,21 @@ def test_states_are_the_forward_kinematics_of_the_clipped_chunk():
     assert torch.equal(padded[..., :7], sent.clamp(-1, 1).flatten(0, 1)) and not padded[..., 7:].any()
 
 
-def test_the_observation_is_the_last_frame_of_the_chunk():
+@pytest.mark.parametrize(("image", "frames"), [(IMAGE, FRAMES), (WRIST_IMAGE, WRIST_FRAMES)])
+def test_the_observation_is_the_last_frame_of_the_chunk(image, frames):
     env = make_env()
     after = env.step(with_chunk(env.reset()))["next"]
-    assert torch.equal(after[IMAGE], after[FRAMES][:, :, -1])
+    assert torch.equal(after[image], after[frames][:, :, -1])
+    assert after[frames].shape == (2, 3, C, 3, SIZE, SIZE)
+
+
+def test_the_state_is_the_last_one_of_the_chunk():
+    env = make_env()
+    after = env.step(with_chunk(env.reset()))["next"]
     assert torch.equal(after[STATE], after[STATES][:, :, -1])
     assert torch.equal(after[KINEMATIC_STATE], after[KINEMATIC_STATES][:, :, -1])
     assert after[STEP_MASK].all() and (after[NUM_STEPS] == C).all()
     assert not after["reward"].any() and not after["terminated"].any()
-
-
-def test_the_world_model_remembers_the_frames_it_asked_for():
-    env = make_env()
-    td = env.reset()
-    first, video, poses = td[IMAGE], [td[IMAGE][:, :, None]], [FK.pose(td[KINEMATIC_STATE])[:, :, None]]
-    for decision in range(3):
-        td = env.step(with_chunk(td, seed=decision))["next"]
-        request = env.world_model.requests[-1]
-        t = decision * C
-        before, before_poses = torch.cat(video, 2).flatten(0, 1), torch.cat(poses, 2).flatten(0, 1)
-        assert torch.equal(request["memory", "frames"], before[:, [t // 2, t]])
-        assert torch.allclose(request["memory", "poses"], before_poses[:, [t // 2, t]], atol=1e-6)
-        assert torch.equal(request["memory", "reference"], first.flatten(0, 1))
-        video.append(td[FRAMES])
-        poses.append(FK.pose(td[KINEMATIC_STATES]))
-
-
-def test_a_row_does_not_depend_on_the_other_rows():
-    together, alone = make_env(3, 2), make_env(1, 2)
-    a = together.reset(given(together, [[0, 0], [4, 4], [2, 2]]), set_state=True)
-    b = alone.reset(given(alone, [[4, 4]]), set_state=True)
-    for decision in range(3):
-        with_chunk(a, seed=decision)
-        b.set(CHUNK, a[CHUNK][1:2])
-        a, b = together.step(a)["next"], alone.step(b)["next"]
-        for key in (FRAMES, KINEMATIC_STATES, STATE, IMAGE):
-            assert torch.equal(a[key][1:2], b[key]), key
-
-
-def test_rollouts_of_a_group_have_different_noise_and_so_have_waves_of_one_context():
-    env = make_env(1, 2, count=1)
-    waves = [env.step(with_chunk(env.reset()))["next", FRAMES] for _ in range(2)]
-    assert not torch.equal(waves[0][0, 0, :, 1], waves[0][0, 1, :, 1])
-    assert not torch.equal(waves[0][0, 0, :, 1], waves[1][0, 0, :, 1])
-
-
-def test_given_contexts_replay_with_the_same_noise():
-    env = make_env(1, 2)
-    start = given(env, [[3, 3]])
-    first, second = (env.step(with_chunk(env.reset(start.clone(), set_state=True)))["next", FRAMES] for _ in range(2))
-    assert torch.equal(first, second)
 
 
 def test_only_active_rows_reach_the_world_model_and_the_others_stand_still():
@@ -225,13 +215,19 @@ def test_only_active_rows_reach_the_world_model_and_the_others_stand_still():
     with_chunk(td, seed=2).set("_step", active)
     after = env.step(td.clone())["next"]
     assert len(env.world_model.requests[-1]) == 3
-    for key in (IMAGE, STATE, KINEMATIC_STATE, NUM_STEPS):
+    for key in (IMAGE, WRIST_IMAGE, STATE, KINEMATIC_STATE, NUM_STEPS):
         assert torch.equal(after[key][~active], td[key][~active]), key
         assert not torch.equal(after[key][active], td[key][active]), key
-    assert not after[STEP_MASK][~active].any()
-    # The frozen rows then go on as if nothing had happened.
+    assert not after[STEP_MASK][~active].any() and not after[FRAMES][~active].any()
+
+
+def test_rows_that_stood_still_go_on_as_if_nothing_had_happened():
+    env = make_env()
+    td = env.step(with_chunk(env.reset()))["next"]
+    active = torch.tensor([[True, False, False], [False, True, True]])
+    after = env.step(with_chunk(td, seed=2).set("_step", active))["next"]
     resumed = env.step(with_chunk(after, seed=3))["next"]
-    assert torch.equal(resumed[FRAMES][:, :, 0, 2, 0, 0], after[IMAGE][:, :, 0, 0, 0])
+    assert torch.equal(resumed[FRAMES][:, :, 0, 0, 0, 0], after[IMAGE][:, :, 0, 0, 0] + 1)
 
 
 def test_a_row_that_is_not_stepped_keeps_its_end():
@@ -252,8 +248,18 @@ def test_max_steps_cuts_the_last_chunk():
     assert td["truncated"].all() and td["done"].all() and not td["terminated"].any()
     assert td[STEP_MASK].flatten(0, 1).tolist() == [[True, True, False, False]] * 6
     assert (td[NUM_STEPS] == C + 2).all()
-    assert torch.equal(td[IMAGE], td[FRAMES][:, :, 1])
+    assert torch.equal(td[IMAGE], td[FRAMES][:, :, 1]) and torch.equal(td[WRIST_IMAGE], td[WRIST_FRAMES][:, :, 1])
     assert torch.equal(td[KINEMATIC_STATE], td[KINEMATIC_STATES][:, :, 1])
+
+
+def test_rows_at_the_end_are_not_imagined_further():
+    env = make_env(max_steps=C)
+    td = env.step(with_chunk(env.reset()))["next"]
+    after = env.step(with_chunk(td, seed=2))["next"]
+    assert len(env.world_model.requests) == 1 and after["truncated"].all()
+    for key in (IMAGE, STATE, NUM_STEPS):
+        assert torch.equal(after[key], td[key]), key
+    assert not after[STEP_MASK].any()
 
 
 def test_a_rollout_ends_when_every_row_is_truncated():
@@ -264,88 +270,14 @@ def test_a_rollout_ends_when_every_row_is_truncated():
     assert rollout["next", "truncated"][..., -1, 0].all() and not rollout["next", "truncated"][..., :-1, 0].any()
 
 
-def test_a_row_reset_alone_restarts_the_context_of_its_group():
-    env = make_env()
-    start = env.reset()
-    td = env.step(with_chunk(start.clone()))["next"]
-    reset = torch.zeros(2, 3, 1, dtype=torch.bool)
-    reset[1, 2] = True
-    again = env.reset(td.clone().set("_reset", reset), set_state=False)
-    for key in (IMAGE, STATE, KINEMATIC_STATE, CONTEXT_ID, NUM_STEPS):
-        assert torch.equal(again[key][1, 2], start[key][1, 2]), key
-        assert torch.equal(again[key][0], td[key][0]), key
-    after = env.step(with_chunk(again))["next"]
-    assert after[NUM_STEPS].flatten().tolist() == [2 * C] * 5 + [C]
-
-
-def test_a_group_reset_as_a_whole_gets_the_next_context():
-    env = make_env()
-    start = env.reset()
-    reset = torch.zeros(2, 3, 1, dtype=torch.bool)
-    reset[1] = True
-    again = env.reset(start.clone().set("_reset", reset), set_state=False)
-    seen = set(start[CONTEXT_ID].flatten().tolist())
-    assert torch.equal(again[CONTEXT_ID][0], start[CONTEXT_ID][0])
-    assert len(set(again[CONTEXT_ID][1].flatten().tolist())) == 1 and int(again[CONTEXT_ID][1, 0]) not in seen
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda c: c[:0], "at least one initial state"),
-        (lambda c: c.exclude(KINEMATIC_STATE), "lack the entries"),
-        (lambda c: c.exclude(INSTRUCTION), "lack the entries"),
-        (lambda c: c.set(IMAGE, c[IMAGE].float()), "must be uint8"),
-        (lambda c: c.set(STATE, torch.zeros(5, 8)), r"must be \(5, 7\)"),
-        (lambda c: c.set(STATE, c[STATE] + 0.5), "another robot"),
-    ],
-)
-def test_unusable_contexts_are_refused(spoil, message):
-    with pytest.raises(ValueError, match=message):
-        ImaginedEnv(CountingWorldModel(), FK, spoil(make_contexts()), [1, 1], max_steps=C, chunk_length=C)
-
-
-@pytest.mark.parametrize(
-    ("chunk", "message"),
-    [
-        (torch.zeros(2, 3, C, 6), "must be floats"),
-        (torch.zeros(2, 3, 7), "must be floats"),
-        (torch.zeros(2, 3, C, 7, dtype=torch.int64), "must be floats"),
-        (torch.full((2, 3, C, 7), float("nan")), "NaN"),
-        (None, "no action chunk"),
-    ],
-)
-def test_unusable_chunks_are_refused(chunk, message):
-    env = make_env()
-    td = env.reset()
-    if chunk is not None:
-        td.set(CHUNK, chunk)
-    with pytest.raises(ValueError, match=message):
-        env.step(td)
-
-
-def test_unusable_settings_are_refused():
-    contexts = make_contexts()
-    for size in ([4], [2, 0], [1, 2, 3]):
-        with pytest.raises(ValueError, match="batch_size"):
-            ImaginedEnv(CountingWorldModel(), FK, contexts, size, max_steps=C)
-    world_model = CountingWorldModel()
-    world_model.image_size = 2 * SIZE
-    with pytest.raises(ValueError, match=f"frames of {2 * SIZE} px, the contexts' images are"):
-        ImaginedEnv(world_model, FK, contexts, [1, 1], max_steps=C, chunk_length=C)
-    with pytest.raises(ValueError, match="proprio"):
-        make_env(proprio="true")
-    with pytest.raises(ValueError, match="max_steps"):
-        make_env(max_steps=0)
-    with pytest.raises(ValueError, match="missing"):
-        env = make_env(1, 1)
-        env.reset(given(env, [[0]]).exclude(CONTEXT_ID), set_state=True)
+# ------------------------------------------------------------------------------------------------ other envs, files
 
 
 def test_physics_and_imagination_have_the_same_interface():
-    real = chunked(TabletopEnv(list_tasks("starter")[0], 6, image_size=SIZE, proprio="commanded", seed=0), C)
+    physics_env = TabletopEnv(list_tasks("starter")[0], 6, image_size=SIZE, cameras=TWO, seed=0)
+    real = chunked(physics_env, C, frames=True)
     start = real.reset()
-    env = ImaginedEnv(CountingWorldModel(), FK, start, [2, 3], max_steps=C, chunk_length=C)
+    env = ImaginedEnv(CountingWorldModel(), FK, start, [2, 3], max_steps=C)
 
     def leaves(spec):
         entries = {key: spec[key] for key in spec.keys(True, True)}
@@ -354,9 +286,9 @@ def test_physics_and_imagination_have_the_same_interface():
     physics, imagination = leaves(real.observation_spec), leaves(env.observation_spec)
     shared = set(physics) - {SUCCESS}
     assert {key: imagination[key] for key in shared} == {key: physics[key] for key in shared}
-    assert set(imagination) - set(physics) == {FRAMES, STATES, KINEMATIC_STATES, NOISE_SEED}
-    assert env.action_keys == real.action_keys == [CHUNK]  # MultiAction leaves its spec's chunk length open (-1)
-    assert env.full_action_spec[CHUNK].shape[-1] == real.full_action_spec[CHUNK].shape[-1] == 7
+    assert set(imagination) - set(physics) == {NOISE_SEED}
+    assert env.action_keys == real.action_keys == [CHUNK]
+    assert env.full_action_spec[CHUNK].shape[-2:] == real.full_action_spec[CHUNK].shape[-2:] == (C, 7)
     assert leaves(env.full_done_spec) == leaves(real.full_done_spec)
     assert leaves(env.full_reward_spec) == leaves(real.full_reward_spec)
     # The same actions move the commanded state the same way.
@@ -374,12 +306,11 @@ def test_a_recording_holds_the_noise_seeds_that_paint_its_frames_again(tmp_path)
     rollouts = env.rollout(3, break_when_any_done=False).reshape(-1, 3)
     world_model = env.base_env.world_model
     env.close()
-    read = read_rollouts(tmp_path / "a.mcap")
-    for key in (FRAMES, IMAGE, NOISE_SEED, KINEMATIC_STATES, STEP_MASK):
-        assert torch.equal(read["next", key] if isinstance(key, str) else read["next", *key], rollouts["next", key])
-    assert torch.equal(read[CHUNK], rollouts[CHUNK])
-    for decision, request in enumerate(world_model.requests):
-        assert torch.equal(read["next", NOISE_SEED][:, decision], request["noise_seed"])
-        assert torch.equal(world_model(request)[FRAMES], read["next", FRAMES][:, decision])
-        if decision == 2:
-            break
+    read = read_rollouts(tmp_path / "a.mcap")["next"]
+    for key in (FRAMES, WRIST_FRAMES, IMAGE, WRIST_IMAGE, NOISE_SEED, KINEMATIC_STATES, STEP_MASK):
+        assert torch.equal(read[key], rollouts["next"][key]), key
+    for decision, asked in enumerate(world_model.requests[:3]):
+        assert torch.equal(read[NOISE_SEED][:, decision], asked[NOISE_SEED])
+        painted = world_model(asked)
+        for key in (FRAMES, WRIST_FRAMES):
+            assert torch.equal(painted[key], read[key][:, decision])

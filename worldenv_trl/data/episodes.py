@@ -111,6 +111,9 @@ class Episodes:
         Args:
             camera: of :attr:`cameras`.
             episode, frame: int64, broadcast to [*B]; past its end an episode shows its last frame.
+
+        Raises:
+            ValueError: for a frame before the first.
         """
         part, index = self._places(episode, frame)
         return self._gather(frames_key(camera), part, index)
@@ -125,6 +128,9 @@ class Episodes:
 
     def _places(self, episode: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
         episode, frame = torch.broadcast_tensors(torch.as_tensor(episode), torch.as_tensor(frame))
+        if bool((frame < 0).any()):  # it would show the episode before
+            first = tuple((frame < 0).nonzero()[0])
+            raise ValueError(f"there is no frame {int(frame[first])} of episode {int(episode[first])}: they begin at 0")
         inside = torch.minimum(frame, self["length"].squeeze(-1)[episode])
         return self._part[episode], self._first[episode] + inside
 
@@ -173,7 +179,7 @@ class Episodes:
         parts = [part for part in parts if len(part)]
         if not parts:
             raise ValueError("there are no episodes to put together")
-        _check_alike(parts)
+        check_alike(parts)
         texts = [text for part in parts for text in part.instructions]
         out = Episodes.__new__(Episodes)
         out.entries, out.instructions = concatenated([part.entries for part in parts]), texts
@@ -182,7 +188,7 @@ class Episodes:
         for part in parts:
             places = []
             for frames in part._parts:
-                known = next((place for place, each in enumerate(stores) if each is frames), len(stores))
+                known = next((place for place, each in enumerate(stores) if _same_store(each, frames)), len(stores))
                 if known == len(stores):
                     stores.append(frames)
                 places.append(known)
@@ -192,7 +198,14 @@ class Episodes:
         return out
 
 
-def _check_alike(parts: Sequence[Episodes]) -> None:
+def _same_store(first: TensorDictBase, second: TensorDictBase) -> bool:
+    """Whether two hold the very same frames, of all cameras."""
+    mine, other = (dict(each.items(True, True)) for each in (first, second))
+    return mine.keys() == other.keys() and all(value is other[key] for key, value in mine.items())
+
+
+def check_alike(parts: Sequence[Episodes]) -> None:
+    """Raises ``ValueError`` for sets with other entries, cameras or image sizes than the first one's."""
     first = parts[0]
     for part in parts[1:]:
         if set(part.entries.keys()) != set(first.entries.keys()):

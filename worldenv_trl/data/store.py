@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 
-from worldenv_trl.data.episodes import Episodes, concatenated
+from worldenv_trl.data.episodes import Episodes, check_alike, concatenated
 from worldenv_trl.data.from_rollouts import episodes_from_rollouts
 from worldenv_trl.keys import ACTION, CHUNK
 from worldenv_trl.record import list_rollouts, read_rollouts
@@ -60,14 +60,18 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
     Small entries are kept beside the frames. Only some rollouts are in memory at a time.
 
     Raises:
-        ValueError: for recordings that cannot be made into episodes, or of different cameras or sizes.
+        ValueError: for recordings that cannot be made into episodes, or of different entries, cameras or sizes, or one
+            that is named twice.
         OSError: if the disk has no room for the frames.
     """
+    if len({Path(path).resolve() for path in recordings}) < len(recordings):
+        raise ValueError(f"recordings must be named each once, got {', '.join(map(str, recordings))}")
     folder = Path(folder)
     partial = folder.with_name(folder.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     sink: FrameSink | None = None
+    alike: Episodes | None = None
     entries: list[TensorDict] = []
     texts: list[str] = []
     infos = {path: list_rollouts(path) for path in recordings}
@@ -76,9 +80,11 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
     )
     for part in (part for path, each in infos.items() for part in _parts(path, len(each))):
         frames, _ = part.video
-        if sink is None:
+        if sink is None or alike is None:
             _check_room(partial, capacity, frames)
             sink = FrameSink(capacity, partial / "frames")
+            alike = Episodes(part.entries[:0], [], frames[:0].clone())
+        check_alike([alike, part])
         sink.add(frames)
         entries.append(part.entries)
         texts += part.instructions
@@ -91,6 +97,7 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
         "recordings": [_identity(path) for path in recordings],
         "counts": [len(each) for each in infos.values()],
         "frames": len(sink.frames),
+        "files": {str(path.relative_to(partial)): path.stat().st_size for path in _files(partial)},
         "instructions": distinct,
         "instruction": [distinct.index(text) for text in texts],
     }
@@ -118,13 +125,22 @@ def open_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
         if manifest["format"] != _FORMAT:
             raise ValueError(f"the episode store {folder} has format {manifest['format']}, not {_FORMAT}: {remedy}")
         held, wanted = manifest["recordings"], [_identity(path) for path in recordings]
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        files = dict(manifest["files"])
+    except (KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"the episode store {folder} is cut short ({error!r}): {remedy}") from error
     if held != wanted:
         names = [", ".join(each["name"] for each in side) for side in (held, wanted)]
         changed = " as they were before they changed" if names[0] == names[1] else ""
         raise ValueError(
             f"the episode store {folder} belongs to other recordings, {names[0]}{changed}, not {names[1]}: {remedy}"
+        )
+    # Before they are mapped: that would fill up what is missing with zeros, in silence.
+    there = {str(path.relative_to(folder)): path.stat().st_size for path in _files(folder)}
+    short = [name for name, size in files.items() if there.get(name) != size]
+    if short:
+        raise ValueError(
+            f"the episode store {folder} is cut short ({short[0]} has {there.get(short[0], 0)} of {files[short[0]]} "
+            f"bytes): {remedy}"
         )
     try:
         frames = TensorDict.load_memmap(folder / "frames")[: manifest["frames"]]
@@ -149,6 +165,11 @@ def release(frames: TensorDictBase) -> None:
         storage = value.untyped_storage()
         if storage.filename:  # never memory that no file stands behind
             libc.madvise(ctypes.c_void_p(storage.data_ptr()), ctypes.c_size_t(storage.nbytes()), _DONTNEED)
+
+
+def _files(folder: Path) -> list[Path]:
+    """Those of a store's frames and entries."""
+    return sorted(path for part in ("frames", "entries") for path in (folder / part).rglob("*") if path.is_file())
 
 
 def _parts(path: str | os.PathLike, count: int) -> Iterator[Episodes]:

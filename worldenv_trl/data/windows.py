@@ -55,7 +55,8 @@ class WindowSampler(Sampler):
         seed: of the draws; from torch's generator when None.
 
     Raises:
-        ValueError: for episodes without a step, or settings out of range.
+        ValueError: for episodes without a step, or without the labels that a ``failure_share`` needs; for settings out
+            of range.
     """
 
     def __init__(
@@ -74,6 +75,8 @@ class WindowSampler(Sampler):
             raise ValueError(f"reset_share must lie between 0 and 1, got {reset_share}")
         if failure_share is not None and not 0 <= failure_share <= 1:
             raise ValueError(f"failure_share must lie between 0 and 1, got {failure_share}")
+        if failure_share is not None and "success" not in episodes:
+            raise ValueError("the episodes carry no success labels: failure_share must be None")
         length = episodes["length"].squeeze(-1)
         if not len(episodes) or not bool(length.any()):
             raise ValueError(f"the {len(episodes)} episodes hold no executed step: there is no window to draw")
@@ -143,7 +146,7 @@ class WindowBuffer(ReplayBuffer):
     def __init__(self, episodes: Episodes, poses: Tensor, sampler: WindowSampler, batch_size: int) -> None:
         frames, _ = episodes.video
         super().__init__(
-            storage=TensorStorage(frames.select(FRAMES)),
+            storage=TensorStorage(frames),
             sampler=sampler,
             writer=ImmutableDatasetWriter(),
             batch_size=batch_size,
@@ -158,6 +161,13 @@ class WindowBuffer(ReplayBuffer):
         if self._drawn % _RELEASE_EVERY == 0:
             release(self._episodes.video[0])
         return (windows, info) if return_info else windows
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where its draws are; the frames are not part of it: nobody writes to them."""
+        return {"sampler": self._sampler.state_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self._sampler.load_state_dict(state_dict["sampler"])
 
     def windows(self, frames: TensorDictBase, info: dict[str, Tensor]) -> TensorDict:
         """Frames [B, K] and what they are, as windows [B]."""
@@ -217,6 +227,7 @@ def window_buffer(
         raise ValueError(
             f"the world model sees {world_model.image_size} px images, the episodes' are {episodes.image_size} px"
         )
+    episodes = episodes.through(world_model.cameras)
     sampler = WindowSampler(episodes, world_model, **options)
     return WindowBuffer(episodes, predicted_poses(episodes, kinematics), sampler, batch_size)
 

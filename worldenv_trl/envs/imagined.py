@@ -199,6 +199,8 @@ class ImaginedEnv(EnvBase):
             text = [self._instructions[i] for i in index.tolist()]
             self._load(fresh.flatten().to(self.device), self._contexts[index.to(self._contexts.device)], text)
             self._kinematic[rows, 1], self._state[rows, 1] = self._kinematic[rows, 0], self._state[rows, 0]
+            for camera in self.cameras:
+                self._image(camera)[rows] = self._kept(camera)[rows, 0]
             self._episode[rows] = self._resets[rows]
         self._begun = [True] * groups
         out = self._observe()

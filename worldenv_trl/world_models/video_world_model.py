@@ -81,6 +81,10 @@ class VideoWorldModelConfig:
             raise ValueError(
                 f"image_size must be a multiple of {max(16, grid)} and at least 32 px, got {self.image_size}"
             )
+        if self.image_size // self.patch < 16:
+            raise ValueError(
+                f"patch must leave at least 16 cells a side, got {self.patch} px of {self.image_size} px images"
+            )
         if not 1 <= self.memory_stride <= self.chunk_length:
             raise ValueError(
                 f"memory_stride must lie between 1 and chunk_length={self.chunk_length}, got {self.memory_stride}"
@@ -186,8 +190,8 @@ class VideoWorldModel(WorldModel, Pretrained):
         self.seen.check(texts)
         with torch.no_grad():
             parts = [
-                self._generate(part, texts[start : start + rows])
-                for start, part in zip(range(0, len(texts), rows), tensordict.split(rows), strict=True)
+                self._generate(tensordict[start : start + rows], texts[start : start + rows])
+                for start in range(0, len(texts), rows)
             ]
         size, device = self.image_size, tensordict[POSES].device
         empty = torch.zeros(0, len(self.cameras), self.chunk_length, 3, size, size, dtype=torch.uint8, device=device)
@@ -226,13 +230,13 @@ class VideoWorldModel(WorldModel, Pretrained):
     def _view(self, index: int, tensordict: TensorDictBase, every: Tensor, texts: Sequence[str]) -> View:
         """What one camera shows; ``every`` [B, M + C, 13] are the poses of memory and chunk."""
         camera, calibrations, action_map = self.cameras[index], self._views[index], self.action_maps[index]
-        which = calibrations.indices(texts).to(every.device)  # [B]
-        poses, size = every[:, _MEMORY:], self.image_size
-        mounted = calibrations.mounted[which]  # [B]
+        which = calibrations.indices(texts)  # [B]
+        mounted = calibrations.mounted[which].to(every.device).view(-1, 1, 1)
+        which, poses, size = which.to(every.device), every[:, _MEMORY:], self.image_size
         if calibrations.any_mounted:
             seen_from = every[:, _MEMORY - 1 : _MEMORY].expand_as(every)  # the camera, as it saw the last frame
             drawn = {"tool_pose": seen_from}
-            carried = torch.where(mounted.to(every.device).view(-1, 1, 1), poses, seen_from[:, _MEMORY:])
+            carried = torch.where(mounted, poses, seen_from[:, _MEMORY:])
             along = {"tool_pose": carried}
         else:
             drawn, along = {}, {}
@@ -240,7 +244,7 @@ class VideoWorldModel(WorldModel, Pretrained):
         maps = torch.cat([action_map(every, which, **drawn), tool_coordinates(pixels, action_map.height)], 2)
         motion = (pixels[:, _MEMORY:] - pixels[:, _MEMORY - 1 : _MEMORY]) * self.config.patch
         if calibrations.any_mounted:
-            motion = torch.where(mounted.to(motion.device).view(-1, 1, 1), -motion, motion)
+            motion = torch.where(mounted, -motion, motion)
         return View(
             memory=to_float(tensordict[memory_key(camera)]),
             memory_maps=maps[:, :_MEMORY],

@@ -1,0 +1,127 @@
+"""Recorded actions imagined, with models whose frames are known in closed form."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from small_rollouts import CAMERAS, make_episodes, same
+from swaps.copying_world_model import CopyingConfig, CopyingWorldModel
+
+from worldenv_trl import keys
+from worldenv_trl.data import Episodes, imagine_episodes
+from worldenv_trl.data.imagine import FrameSink
+from worldenv_trl.kinematics import ForwardKinematics
+from worldenv_trl.language import instructions_of
+
+C = 4
+FK = ForwardKinematics()
+LENGTHS = [9, 3, 12, 8, 1]
+
+
+class CountingWorldModel(CopyingWorldModel):
+    """Red counts on from the newest remembered red, green is the seed's, blue the first remembered frame's red."""
+
+    def __init__(self, config: CopyingConfig) -> None:
+        super().__init__(config)
+        self.requests = []
+
+    def forward(self, tensordict):
+        self.requests.append(tensordict.clone())
+        later = torch.arange(1, C + 1)
+        super().forward(tensordict)
+        for camera in self.cameras:
+            memory = tensordict["memory", "frames", keys.image_entry(camera)][:, :, 0, 0, 0]
+            frames = tensordict[keys.frames_key(camera)]
+            frames[:, :, 0] = (memory[:, -1:] + later)[..., None, None].to(torch.uint8)
+            frames[:, :, 1] = (tensordict[keys.NOISE_SEED] % 251)[..., None, None].to(torch.uint8)
+            frames[:, :, 2] = memory[:, :1, None, None]
+        return tensordict
+
+
+def counting(cameras=CAMERAS) -> CountingWorldModel:
+    return CountingWorldModel(CopyingConfig(cameras=tuple(cameras), image_size=8, chunk_length=C, stride=2))
+
+
+def imagined(model=None, lengths=LENGTHS, **options) -> Episodes:
+    return imagine_episodes(model or counting(), make_episodes(lengths), FK, **options)
+
+
+def colour(episodes: Episodes, camera: str, row: int, channel: int) -> list[int]:
+    steps = torch.arange(int(episodes["length"][row]) + 1)
+    return episodes.frames(camera, torch.tensor(row), steps)[:, channel, 0, 0].tolist()
+
+
+def test_imagination_goes_on_from_the_first_frame_on_its_own_frames():
+    episodes = imagined()
+    for row, length in enumerate(LENGTHS):
+        for camera, more in zip(CAMERAS, (0, 7), strict=True):
+            assert colour(episodes, camera, row, 0) == [50 * row + more + step for step in range(length + 1)]
+
+
+def test_what_the_model_remembers_is_what_it_painted():
+    blue = colour(imagined(), "wrist", 2, 2)
+    assert blue == [107] * 1 + [107] * 4 + [109] * 4 + [113] * 4  # the first frame is real: grey
+
+
+def test_a_copying_model_shows_the_first_frame_to_the_end():
+    episodes = imagined(CopyingWorldModel(CopyingConfig(CAMERAS, 8, C)))
+    assert colour(episodes, "wrist", 2, 1) == [107] * 13
+
+
+def test_everything_but_frames_and_kinematics_stays():
+    episodes, real = imagined(), make_episodes(LENGTHS)
+    assert episodes.instructions == real.instructions
+    for name in ("actions", "states", "success", "length", keys.TASK_ID, keys.CONTEXT_ID):
+        assert torch.equal(episodes[name], real[name])
+
+
+def test_kinematic_states_are_predicted_open_loop():
+    episodes, real = imagined(), make_episodes(LENGTHS)
+    first = real["kinematic_states"][:, 0]
+    assert torch.equal(episodes["kinematic_states"][:, 0], first)
+    assert torch.allclose(episodes["kinematic_states"][:, 1:], FK.rollout(first, real["actions"]), atol=1e-6)
+
+
+def test_the_model_is_asked_with_the_poses_actions_and_goals_of_the_recording():
+    model = counting()
+    imagined(model)
+    real = make_episodes(LENGTHS)
+    poses = FK.pose(FK.rollout(real["kinematic_states"][:, 0], real["actions"]))
+    for decision, td in enumerate(model.requests):
+        steps = slice(decision * C, decision * C + C)
+        assert torch.allclose(td["poses"], poses[:, steps], atol=1e-6)
+        assert torch.equal(td["padded_actions"][..., :7], real["actions"][:, steps])
+        assert instructions_of(td) == real.instructions
+
+
+@pytest.mark.parametrize("rows_at_once", [1, 2])
+def test_how_many_episodes_are_imagined_at_once_changes_nothing(rows_at_once):
+    assert same(imagined(rows_at_once=rows_at_once), imagined())
+
+
+def test_noise_is_of_the_seed_the_episode_and_the_chunk():
+    first, again, other = imagined(), imagined(), imagined(seed=1)
+    assert same(first, again) and not same(first, other)
+    seeds = {*colour(first, "agentview", 0, 1)[1::C], *colour(first, "agentview", 2, 1)[1::C]}
+    assert len(seeds) == 3 + 3
+
+
+def test_frames_on_disk_are_those_in_memory(tmp_path):
+    stored = imagined(folder=tmp_path / "frames", rows_at_once=2)
+    assert same(stored, imagined())
+    assert all(value.untyped_storage().filename for value in stored.video[0].values(True, True))
+    assert any((tmp_path / "frames").rglob("*.memmap"))
+
+
+def test_there_are_frames_of_the_models_cameras_alone():
+    episodes = imagined(counting(["wrist"]))
+    assert episodes.cameras == ("wrist",) and colour(episodes, "wrist", 1, 0) == [57, 58, 59, 60]
+
+
+def test_a_sink_shows_the_frames_that_it_was_given_and_no_others(tmp_path):
+    frames = make_episodes(LENGTHS).video[0]
+    for folder in (None, tmp_path):
+        sink = FrameSink(2 * len(frames), folder)
+        for part in frames.split(7):
+            sink.add(part)
+        assert len(sink.frames) == len(frames) and (sink.frames == frames).all()
