@@ -51,7 +51,7 @@ def made(tmp_path_factory):
     (folder / "taken.mcap").write_bytes(b"precious")
     (folder / "taken.rrd").write_bytes(b"precious")
     RolloutWriter(folder / "bare.mcap").close()
-    OFTPolicy(OFTConfig.for_tasks({0: "do it"}, dim=32, depth=1)).save_pretrained(folder / "policy")
+    OFTPolicy(OFTConfig(instructions=("do it",), dim=32, depth=1)).save_pretrained(folder / "policy")
     return folder
 
 
@@ -74,7 +74,7 @@ EVERYONE = [
     (("text.mcap",), "text.mcap is not an MCAP file"),
     (("empty.mcap",), "empty.mcap is not an MCAP file: it has 0 bytes"),
     (("foreign.mcap",), "foreign.mcap holds no worldenv_trl rollouts: it was written by another program"),
-    (("later.mcap",), "later.mcap has format version 99, this release reads up to 2: update worldenv_trl"),
+    (("later.mcap",), "later.mcap has format version 99, this release reads up to 3: update worldenv_trl"),
 ]
 READERS = [
     *EVERYONE,

@@ -32,7 +32,9 @@ def run(tmp_path_factory):
     rollouts = next(iter(GroupCollector(env, None, groups_per_batch=2, group_size=1)))[:, 0]
     with RolloutWriter(folder / "rollouts" / "real.mcap", **provenance(env)) as writer:
         writer.write(rollouts)
-    config = VideoWorldModelConfig.for_cameras({0: env.tasks[0].camera("agentview")}, **SMALL)
+    config = VideoWorldModelConfig.for_cameras(
+        {"agentview": {env.tasks[0].language: env.tasks[0].camera("agentview")}}, **SMALL
+    )
     for name in ("world_model", "world_model_2"):
         model = VideoWorldModel(config).eval()
         for parameter in model.parameters():

@@ -10,13 +10,12 @@ import pytest
 import torch
 import yaml
 
-from config import GOAL_TASKS, PRESETS
-from parts import task_instructions
+from config import GOAL_TASKS, PRESETS, SFT
+from parts import make_policy, make_reflector, make_world_model
 from report import Report, main
+from run import write_rules
 from run_folder import RunFolder
-from train_world_model import new_model
-from worldenv_trl.policies import OFTConfig, OFTPolicy
-from worldenv_trl.reflectors import CompactReflector, CompactReflectorConfig
+from worldenv_trl.reflectors import StopRule
 
 
 @pytest.fixture(scope="module")
@@ -29,14 +28,16 @@ def finished(tmp_path_factory):
         num_threads=1,
         tasks=GOAL_TASKS[1:2],
         max_steps=16,
+        sft=SFT(dim=32, depth=1),
     )
     folder = RunFolder(config.run_dir)
     folder.open(config)
-    policy = OFTPolicy(OFTConfig.for_tasks(task_instructions(config), dim=32, depth=1))
+    policy = make_policy(config)
     for name in ("sft", "post_train"):
         policy.save_pretrained(folder.checkpoint(name))
-    new_model(config).save_pretrained(folder.checkpoint("world_model"))
-    CompactReflector(CompactReflectorConfig(num_tasks=2)).save_pretrained(folder.checkpoint("reflector"))
+    make_world_model(config).save_pretrained(folder.checkpoint("world_model"))
+    make_reflector(config).save_pretrained(folder.checkpoint("reflector"))
+    write_rules(folder.checkpoint("reflector"), dict.fromkeys(("real", "imagined"), StopRule()))
     folder.log("sft", step=0, l1=1.0)
     return config.run_dir
 
@@ -113,7 +114,7 @@ def test_a_file_is_no_run_folder_and_stays_as_it_is(tmp_path):
     ("task", "message"),
     [
         ("goal/open_the_drawer_of_yore", "the run's task 'goal/open_the_drawer_of_yore' is not one of this release"),
-        ("goal/put_the_bowl_on_the_plate", "the models of this run do not know goal/put_the_bowl_on_the_plate (number"),
+        ("goal/put_the_bowl_on_the_plate", "the models of this run do not know 'put the bowl on the plate'"),
     ],
 )
 def test_tasks_that_have_changed_since_are_named_with_the_remedy(finished, tmp_path, capsys, task, message):

@@ -9,33 +9,18 @@ import signal
 import pytest
 import torch
 
-from config import GOAL_TASKS, PRESETS, Demonstrate, Evaluate, Explore, PostTrain, Reflector, WorldModel
-from config import SFT as SFTConfig
-from parts import check_config, read_contexts
+import world_env
+from checks import check_config
+from config import GOAL_TASKS, PRESETS, Demonstrate, Explore, PostTrain, WorldModel
+from imagination import read_contexts
+from run import Run
 from run_folder import RunFolder
-from world_env import parse, run_all, run_single, stages
+from stages import open_run, parse, plan, rerun
+from train_world_model import train_world_model
+from world_env import run_all
 from worldenv_trl import keys
 from worldenv_trl.envs import context_id
 from worldenv_trl.record import read_rollouts
-
-
-@pytest.fixture
-def tiny(tmp_path):
-    return dataclasses.replace(
-        PRESETS["smoke"][1],
-        run_dir=tmp_path / "run",
-        num_threads=1,
-        tasks=GOAL_TASKS[1:2],
-        max_steps=16,
-        train_states=4,
-        demonstrate=Demonstrate(episodes_per_task=1),
-        sft=SFTConfig(steps=3, scale_steps=2),
-        explore=Explore(episodes_per_task=8, num_envs=4, scale_factors=(1.0,)),
-        world_model=WorldModel(steps=2, batch_size=2),
-        reflector=Reflector(encoder_steps=2, steps=2, batch_size=4),
-        post_train=PostTrain(iterations=1, groups=2, group_size=2, epochs=1, probe_contexts=2),
-        evaluate=Evaluate(episodes_per_task=2, num_envs=2),
-    )
 
 
 def test_presets_parse_and_single_settings_are_overridden():
@@ -44,7 +29,7 @@ def test_presets_parse_and_single_settings_are_overridden():
 
 
 def test_later_rounds_start_from_the_policy_of_the_round_before():
-    names = [stage.name for stage in stages(dataclasses.replace(PRESETS["smoke"][1], rounds=2))]
+    names = [stage.name for stage in plan(dataclasses.replace(PRESETS["smoke"][1], rounds=2))]
     assert names.index("post_train") < names.index("explore_2") < names.index("post_train_2") < names.index("evaluate")
 
 
@@ -84,7 +69,7 @@ def test_the_whole_loop_runs_writes_its_files_and_continues_where_it_stopped(tin
     threads = torch.get_num_threads()
     run_all(tiny)
     folder = RunFolder(tiny.run_dir)
-    assert all(folder.done(stage.name) for stage in stages(tiny))
+    assert all(folder.done(stage.name) for stage in plan(tiny))
     assert {path.name for path in (tiny.run_dir / "checkpoints").iterdir()} >= {
         "sft",
         "world_model",
@@ -92,7 +77,7 @@ def test_the_whole_loop_runs_writes_its_files_and_continues_where_it_stopped(tin
         "post_train",
     }
     assert all((tiny.run_dir / "plots" / f"{name}.png").exists() for name in ("losses", "evaluation"))
-    contexts = read_contexts(folder)[keys.CONTEXT_ID].flatten().tolist()
+    contexts = read_contexts(Run(tiny, folder), tiny.cameras)[keys.CONTEXT_ID].flatten().tolist()
     assert contexts == [context_id(0, "train", index) for index in range(4)]  # exploration visits every one
     wave = read_rollouts(folder.rollouts("post_train_000"))
     steps = wave["next", keys.STEP_MASK]
@@ -111,9 +96,7 @@ def test_the_whole_loop_runs_writes_its_files_and_continues_where_it_stopped(tin
 
     # A lost output, or an earlier stage that ran again, makes a stage unfinished.
     shutil.rmtree(folder.checkpoint("reflector"))
-    monkeypatch.setattr("sys.argv", ["demonstrate.py"])
-    monkeypatch.setattr("world_env.parse", lambda _: tiny)
-    run_single("train_world_model")
+    rerun("train_world_model", train_world_model, open_run(tiny))
     run_all(tiny)
     printed = capsys.readouterr().out
     assert "explore: finished, skipped" in printed and "world_model: finished, skipped" in printed
@@ -129,7 +112,7 @@ def test_an_interrupt_ends_with_one_line_even_if_a_library_turns_it_into_an_erro
             raise RuntimeError("converting a tensordict to boolean") from error
 
     before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr("demonstrate.run", struck)
+    monkeypatch.setitem(world_env.WORKS, "demonstrate", struck)
     with pytest.raises(SystemExit, match="interrupted in stage demonstrate: the same command continues"):
         run_all(tiny)
     assert not RunFolder(tiny.run_dir).done("demonstrate")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from worldenv_trl.world_models.base import WorldModel, request
+from worldenv_trl.world_models.base import WorldModel, memory_key, reference_key, request
 from worldenv_trl.world_models.video_world_model import VideoWorldModel, VideoWorldModelConfig
 from worldenv_trl.world_models.window import Window
 
-__all__ = ["VideoWorldModel", "VideoWorldModelConfig", "Window", "WorldModel", "request"]
+__all__ = ["VideoWorldModel", "VideoWorldModelConfig", "Window", "WorldModel", "memory_key", "reference_key", "request"]
