@@ -76,15 +76,10 @@ def post_train(run: Run, source: str, target: str, models: str) -> None:
         if settings.standardize:
             advantage = advantage / advantage.std().clamp_min(1e-6)
         wave[keys.ADVANTAGE] = advantage[..., None, None].expand(*wave.shape, 1)
-        learned = (keys.CHUNK, keys.LOG_PROBS, keys.ADVANTAGE, ("next", keys.STEP_MASK), keys.MASK)
-        mask = wave[keys.MASK]
-        total_steps = (wave["next", keys.STEP_MASK] & mask.unsqueeze(-1)).sum()  # of Eq. 5: all that was executed
-        decisions = wave.select(*policy.in_keys, *learned)[mask & (wave[keys.ADVANTAGE].squeeze(-1) != 0)]
-        decisions[keys.STEP_MASK] = decisions["next", keys.STEP_MASK]
         about = {}
         if iteration in recorded:  # of the weights that collected it
             about = recording(config, env, target, {"policy": policy} | judges, iteration=iteration)
-        metrics = update(decisions, total_steps, loss, optimizer, list(groups.values()), settings)
+        metrics = update(wave, policy.in_keys, loss, optimizer, list(groups.values()), settings)
         stuck_for = stuck(stuck_for, metrics)
         if stuck_for == PATIENCE:
             progress.write(STUCK.format(target, iteration, stuck_for, settings.max_kl))

@@ -7,6 +7,7 @@ import math
 import torch
 
 from config import PostTrain
+from worldenv_trl import keys
 
 PATIENCE = 3  # iterations
 STUCK = (
@@ -22,15 +23,27 @@ def rate_factor(iteration: int, settings: PostTrain) -> float:
     return min(warmup, 0.55 + 0.45 * math.cos(math.pi * iteration / settings.iterations))
 
 
-def update(decisions, total_steps, loss, optimizer, parameter_groups, settings) -> dict[str, float]:
-    """K epochs of clipped updates on one batch of decisions, stopped when the policy has moved too far.
+def update(wave, in_keys, loss, optimizer, parameter_groups, settings: PostTrain) -> dict[str, float]:
+    """K epochs of clipped updates on the decisions of a wave, stopped when the policy has moved too far.
 
-    Without a decision that teaches something there is no update: the optimiser's moments would move the policy alone.
+    Args:
+        wave: [G, N, T] with advantages.
+        in_keys: what the policy reads.
+
+    Decisions without an advantage teach nothing and are left out, but count among Eq. 5's steps. If there is no other
+    one, nothing moves: the optimiser's moments alone would.
     """
+    mask = wave[keys.MASK]
+    informative = mask & (wave[keys.ADVANTAGE].squeeze(-1) != 0)
+    if not informative.any():
+        return {"updates": 0, "kl_stop": 0.0}
+    learned = (keys.CHUNK, keys.LOG_PROBS, keys.ADVANTAGE, ("next", keys.STEP_MASK), keys.MASK)
+    # Flat first: a mask that leaves a whole block of texts without one makes tensordict stumble over the empty stack.
+    decisions = wave.select(*in_keys, *learned).reshape(-1)[informative.flatten()]
+    decisions[keys.STEP_MASK] = decisions["next", keys.STEP_MASK]
+    total_steps = (wave["next", keys.STEP_MASK] & mask.unsqueeze(-1)).sum()
     sums: dict[str, float] = {}
     count, stopped = 0, False
-    if not len(decisions):
-        return {"updates": 0, "kl_stop": 0.0}
     for _ in range(settings.epochs):
         for rows in torch.randperm(len(decisions)).split(settings.minibatch_size):
             batch = decisions[rows]

@@ -69,15 +69,15 @@ def test_an_iteration_without_an_informative_decision_moves_nothing():
     loss = LOOPLoss(actor, functional=False)
     optimizer = torch.optim.AdamW([parameter for group in groups.values() for parameter in group], lr=0.1)
     with torch.no_grad():
-        batch = actor(decisions(6))
-    batch[keys.ADVANTAGE] = torch.tensor([[1.0], [-1.0]] * 3)
-    batch[keys.STEP_MASK] = torch.ones(6, 8, dtype=torch.bool)
-    settings = PostTrain(epochs=1, minibatch_size=6)
-    done = update(batch, torch.tensor(48), loss, optimizer, list(groups.values()), settings)
-    assert done["updates"] == 1  # now the optimiser has momentum
+        wave = actor(decisions(6)).reshape(1, 2, 3)
+    wave[keys.ADVANTAGE] = torch.tensor([1.0, -1.0]).view(1, 2, 1, 1).expand(1, 2, 3, 1).clone()
+    wave["next", keys.STEP_MASK] = torch.ones(1, 2, 3, 8, dtype=torch.bool)
+    wave[keys.MASK] = torch.ones(1, 2, 3, dtype=torch.bool)
+    last = (policy.in_keys, loss, optimizer, list(groups.values()), PostTrain(epochs=1, minibatch_size=6))
+    assert update(wave, *last)["updates"] == 1  # now the optimiser has momentum
     before = copy.deepcopy(policy.state_dict())
-    done = update(batch[:0], torch.tensor(48), loss, optimizer, list(groups.values()), settings)
-    assert done == {"updates": 0, "kl_stop": 0.0}
+    wave[keys.ADVANTAGE].zero_()
+    assert update(wave, *last) == {"updates": 0, "kl_stop": 0.0}
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
 
 

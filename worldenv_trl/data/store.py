@@ -6,14 +6,17 @@ import ctypes
 import hashlib
 import itertools
 import json
+import logging
 import os
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl import torchrl_logger
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 
 from worldenv_trl.data.episodes import Episodes, check_alike, concatenated
@@ -44,7 +47,8 @@ class FrameSink:
 
     def add(self, frames: TensorDictBase) -> None:
         """``frames`` [n] behind those that are there."""
-        self.buffer.extend(frames)
+        with _without_notices():
+            self.buffer.extend(frames)
         if self._on_disk:
             release(self.frames)
 
@@ -170,6 +174,17 @@ def release(frames: TensorDictBase) -> None:
 def _files(folder: Path) -> list[Path]:
     """Those of a store's frames and entries."""
     return sorted(path for part in ("frames", "entries") for path in (folder / part).rglob("*") if path.is_file())
+
+
+@contextmanager
+def _without_notices() -> Iterator[None]:
+    """TorchRL tells of every storage that it begins."""
+    before = torchrl_logger.level
+    torchrl_logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        torchrl_logger.setLevel(before)
 
 
 def _parts(path: str | os.PathLike, count: int) -> Iterator[Episodes]:
