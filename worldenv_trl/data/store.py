@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import itertools
 import json
 import logging
 import os
 import shutil
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,14 +20,14 @@ from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 from worldenv_trl.data.episodes import Episodes, check_alike, concatenated
 from worldenv_trl.data.from_rollouts import episodes_from_rollouts
 from worldenv_trl.keys import ACTION, CHUNK
+from worldenv_trl.memmap import release
 from worldenv_trl.record import list_rollouts, read_rollouts
 
-__all__ = ["FrameSink", "fill_store", "open_store", "release"]
+__all__ = ["FrameSink", "fill_store", "open_store"]
 
 _MANIFEST = "episodes.json"
 _FORMAT = 1
 _AT_ONCE = 16  # rollouts in memory while a recording is read
-_DONTNEED = 4  # of madvise
 
 
 class FrameSink:
@@ -155,20 +153,6 @@ def open_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
         return [episodes[start:end] for start, end in itertools.pairwise(ends)]
     except (OSError, RuntimeError, KeyError, IndexError, ValueError) as error:
         raise ValueError(f"the episode store {folder} is cut short or damaged ({error}): {remedy}") from error
-
-
-def release(frames: TensorDictBase) -> None:
-    """Lets the system take back the memory that shows files of memory-mapped ``frames``; they are read again if needed.
-
-    Does nothing for tensors in memory, nor where there is no ``madvise``.
-    """
-    if not sys.platform.startswith("linux"):
-        return
-    libc = ctypes.CDLL(None)
-    for value in frames.values(True, True):
-        storage = value.untyped_storage()
-        if storage.filename:  # never memory that no file stands behind
-            libc.madvise(ctypes.c_void_p(storage.data_ptr()), ctypes.c_size_t(storage.nbytes()), _DONTNEED)
 
 
 def _files(folder: Path) -> list[Path]:

@@ -12,9 +12,9 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 
 from worldenv_trl.data.episodes import Episodes
-from worldenv_trl.data.store import release
 from worldenv_trl.keys import FRAMES, INSTRUCTION, TASK_ID
 from worldenv_trl.kinematics import ForwardKinematics
+from worldenv_trl.memmap import release
 from worldenv_trl.world_models import WorldModel
 
 __all__ = ["WindowBuffer", "WindowSampler", "predicted_poses", "window_buffer"]
