@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import overload
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -63,6 +64,12 @@ class Episodes:
 
     def __contains__(self, name: str) -> bool:
         return name in self.entries.keys()  # noqa: SIM118 - a TensorDict iterates over rows
+
+    @overload
+    def __getitem__(self, item: str) -> Tensor: ...
+
+    @overload
+    def __getitem__(self, item: slice | Tensor | Sequence[int]) -> Episodes: ...
 
     def __getitem__(self, item: str | slice | Tensor | Sequence[int]) -> Tensor | Episodes:
         if isinstance(item, str):
