@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import NonTensorStack, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
@@ -15,6 +15,7 @@ from worldenv_trl.data.episodes import Episodes
 from worldenv_trl.keys import FRAMES, INSTRUCTION, TASK_ID
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.memmap import release
+from worldenv_trl.row_texts import row_texts
 from worldenv_trl.world_models import WorldModel
 
 __all__ = ["WindowBuffer", "WindowSampler", "predicted_poses", "window_buffer"]
@@ -187,7 +188,7 @@ class WindowBuffer(ReplayBuffer):
             },
             batch_size=[len(episode)],
         )
-        out.set(INSTRUCTION, NonTensorStack(*(episodes.instructions[index] for index in episode.tolist())))
+        out.set(INSTRUCTION, row_texts([episodes.instructions[index] for index in episode.tolist()]))
         return out
 
 
