@@ -7,9 +7,25 @@ import sys
 
 from tensordict import TensorDictBase
 
-__all__ = ["release"]
+__all__ = ["Reading", "release"]
 
 _DONTNEED = 4  # of madvise
+_MOST = 256_000_000  # bytes that are read before they are given back
+
+
+class Reading:
+    """Counts what is read of memory-mapped frames and gives it back in time: what a file shows fills memory, too."""
+
+    def __init__(self) -> None:
+        self._bytes = 0
+
+    def add(self, nbytes: int, *frames: TensorDictBase) -> None:
+        """``nbytes`` of ``frames`` were read."""
+        self._bytes += nbytes
+        if self._bytes > _MOST:
+            self._bytes = 0
+            for each in frames:
+                release(each)
 
 
 def release(frames: TensorDictBase) -> None:

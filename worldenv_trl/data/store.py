@@ -21,7 +21,8 @@ from worldenv_trl.data.episodes import Episodes, check_alike, concatenated
 from worldenv_trl.data.from_rollouts import episodes_from_rollouts
 from worldenv_trl.keys import ACTION, CHUNK
 from worldenv_trl.memmap import release
-from worldenv_trl.record import list_rollouts, read_rollouts
+from worldenv_trl.record import list_rollouts, read_metadata, read_rollouts
+from worldenv_trl.record.mcap.recording import Recording
 
 __all__ = ["FrameSink", "fill_store", "open_store"]
 
@@ -76,11 +77,9 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
     alike: Episodes | None = None
     entries: list[TensorDict] = []
     texts: list[str] = []
-    infos = {path: list_rollouts(path) for path in recordings}
-    capacity = sum(
-        _steps_per_entry(path) * sum(info.length for info in each) + len(each) for path, each in infos.items() if each
-    )
-    for part in (part for path, each in infos.items() for part in _parts(path, len(each))):
+    counts = {path: Recording(Path(path)).count() for path in recordings}
+    capacity = sum(count * (_longest(path) + 1) for path, count in counts.items() if count)
+    for part in (part for path, count in counts.items() for part in _parts(path, count)):
         frames, _ = part.video
         if sink is None or alike is None:
             _check_room(partial, capacity, frames)
@@ -97,7 +96,7 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
     manifest = {
         "format": _FORMAT,
         "recordings": [_identity(path) for path in recordings],
-        "counts": [len(each) for each in infos.values()],
+        "counts": list(counts.values()),
         "frames": len(sink.frames),
         "files": {str(path.relative_to(partial)): path.stat().st_size for path in _files(partial)},
         "instructions": distinct,
@@ -176,10 +175,14 @@ def _parts(path: str | os.PathLike, count: int) -> Iterator[Episodes]:
         yield episodes_from_rollouts(read_rollouts(path, rollouts=slice(start, start + _AT_ONCE)))
 
 
-def _steps_per_entry(path: str | os.PathLike) -> int:
-    """1, or the chunk length of a recording of decisions."""
+def _longest(path: str | os.PathLike) -> int:
+    """No rollout of a recording has more env steps: what its env was limited to, or else what it holds."""
+    limits = read_metadata(path).get("env", {}).get("max_steps")
+    if limits is not None:
+        return int(max(limits)) if isinstance(limits, list) else int(limits)
     one = read_rollouts(path, rollouts=[0])
-    return 1 if one.get(ACTION, None) is not None else one[CHUNK].shape[-2]
+    steps = 1 if one.get(ACTION, None) is not None else one[CHUNK].shape[-2]
+    return steps * max(info.length for info in list_rollouts(path))
 
 
 def _check_room(folder: Path, count: int, frames: TensorDictBase) -> None:
