@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import overload
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -63,6 +64,12 @@ class Episodes:
 
     def __contains__(self, name: str) -> bool:
         return name in self.entries.keys()  # noqa: SIM118 - a TensorDict iterates over rows
+
+    @overload
+    def __getitem__(self, item: str) -> Tensor: ...
+
+    @overload
+    def __getitem__(self, item: slice | Tensor | Sequence[int]) -> Episodes: ...
 
     def __getitem__(self, item: str | slice | Tensor | Sequence[int]) -> Tensor | Episodes:
         if isinstance(item, str):
@@ -137,12 +144,13 @@ class Episodes:
     def _gather(self, key: tuple[str, str], part: Tensor, index: Tensor) -> Tensor:
         if len(self._parts) == 1:
             return self._parts[0][key][index]
-        out = None
+        out: Tensor | None = None
         for number, frames in enumerate(self._parts):
             here = part == number
             found = frames[key][index[here]]
             out = found.new_empty(*index.shape, *found.shape[1:]) if out is None else out
             out[here] = found
+        assert out is not None  # there is at least one store
         return out
 
     # ------------------------------------------------------------------------------------------------- together

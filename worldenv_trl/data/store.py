@@ -133,7 +133,7 @@ def open_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
     except (KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"the episode store {folder} is cut short ({error!r}): {remedy}") from error
     if held != wanted:
-        names = [", ".join(each["name"] for each in side) for side in (held, wanted)]
+        names = [", ".join(str(each["name"]) for each in side) for side in (held, wanted)]
         changed = " as they were before they changed" if names[0] == names[1] else ""
         raise ValueError(
             f"the episode store {folder} belongs to other recordings, {names[0]}{changed}, not {names[1]}: {remedy}"

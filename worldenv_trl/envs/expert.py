@@ -80,8 +80,8 @@ class ExpertPolicy(TensorDictModuleBase):
         if (
             started.any() and tensordict.get(INSTRUCTION, None) is not None
         ):  # not every step: texts take time to compare
-            for row, (shown, own) in enumerate(zip(instructions_of(tensordict), self._words, strict=True)):
-                if shown != own:
+            for row, (text, words) in enumerate(zip(instructions_of(tensordict), self._words, strict=True)):
+                if text != words:
                     raise ValueError(
-                        f"this expert's env asks to {own!r} in row {row}, the tensordict {shown!r}: {remedy}"
+                        f"this expert's env asks to {words!r} in row {row}, the tensordict {text!r}: {remedy}"
                     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import NonTensorStack, TensorDict, TensorDictBase
 from torch import Tensor
@@ -177,7 +179,7 @@ class ImaginedEnv(EnvBase):
             turn[tasks[index]] = turns[-1] + 1
         return [index for _, index in sorted(zip(turns, shuffled, strict=True), key=lambda pair: pair[0])]
 
-    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
         groups, rollouts = self.batch_size
         mask = tensordict.get("_reset", None) if tensordict is not None else None
         if mask is None:
@@ -225,7 +227,7 @@ class ImaginedEnv(EnvBase):
         keys = set() if tensordict is None else set(tensordict.keys(True, True))
         needed = context_keys(self.cameras)
         missing = [key for key in needed if key not in keys]
-        if missing:
+        if tensordict is None or missing:
             raise ValueError(f"reset(set_state=True) needs {needed} in its tensordict; missing: {missing}")
         start = tensordict.select(*needed).to(self.device).flatten(0, 1)[rows]
         size = (3, self.image_size, self.image_size)

@@ -159,7 +159,9 @@ class MCAPLogger(Logger):
         if values:
             self.experiment.write_metadata("hparams", values)
 
-    def log_histogram(self, name: str, data: Sequence, *, step: int | None = None, bins: int = 32, **_: Any) -> None:
+    def log_histogram(
+        self, name: str, data: Sequence | Tensor, *, step: int | None = None, bins: int = 32, **_: Any
+    ) -> None:
         """A histogram as JSON on ``/<name>``: ``counts`` [bins], ``edges`` [bins + 1], ``step``."""
         values = np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data, dtype=np.float64).ravel()
         counts, edges = np.histogram(values, bins=bins)

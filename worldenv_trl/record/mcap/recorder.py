@@ -99,7 +99,7 @@ class Recorder(Transform):
                 raise TypeError(f"{name} must be a worldenv_trl.kinematics.{kind}, got {part!r}")
         self._target = Path(path)
         self._options = {"metadata": metadata, "attachments": attachments, "overwrite": overwrite}
-        self._derived = {"kinematics": kinematics, "action_map": action_map}
+        self._derived: dict[str, Any] = {"kinematics": kinematics, "action_map": action_map}
         paths = [(key,) if isinstance(key, str) else key for key in exclude]
         self._exclude = [path[1:] if path[0] == "next" and len(path) > 1 else path for path in paths]
         self._worker, self._queue_size = worker, queue_size
@@ -153,6 +153,7 @@ class Recorder(Transform):
         rows = active.nonzero().squeeze(-1)
         if not len(rows):
             return next_tensordict
+        assert self._stream is not None and self._paths is not None and self._fresh is not None  # it is open
         roots, nexts, chained, texts = self._paths
         batch = len(self.parent.batch_size)
         everyone = len(rows) == len(active)

@@ -255,7 +255,7 @@ def _contents(name: str, value: bytes | str | os.PathLike) -> bytes:
     return str(value).encode()
 
 
-def _row_texts(path: tuple[str, ...], value: Any, shape: tuple[int, int], lengths: Tensor) -> list[str]:
+def _row_texts(path: tuple[str, ...], value: Any, shape: Sequence[int], lengths: Tensor) -> list[str]:
     """One text for each rollout, from nested lists [*B, T]."""
     rows, steps = shape
     words = [value] * (rows * steps) if isinstance(value, str) else _flatten(value)
