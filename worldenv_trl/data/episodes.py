@@ -39,6 +39,16 @@ class Episodes:
 
     Raises:
         ValueError: if the numbers of episodes, texts and frames do not go together.
+
+    Examples:
+        >>> from worldenv_trl.data import episodes_from_rollouts
+        >>> from worldenv_trl.envs import TabletopEnv
+        >>> episodes = episodes_from_rollouts(TabletopEnv("starter/open_the_top_drawer", 3, seed=0).rollout(5))
+        >>> episodes["actions"].shape, episodes.instructions[0]
+        (torch.Size([3, 5, 7]), 'open the top drawer of the cabinet')
+        >>> some = Episodes.cat([episodes[:2], episodes[torch.tensor([2, 0])]])
+        >>> some.frames("agentview", torch.arange(4), torch.tensor(5)).shape  # the last one of each
+        torch.Size([4, 3, 64, 64])
     """
 
     def __init__(

@@ -53,9 +53,13 @@ class MCAPLogger(Logger):
         OSError: from :meth:`shutdown`, if the file could not be completed.
 
     Examples:
-        >>> logger = MCAPLogger("post_train", "runs/demo")
-        >>> logger.log_scalar("reward", 0.5, step=1)
-        >>> logger.shutdown()
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     logger = MCAPLogger("post_train", folder)
+        ...     logger.log_scalar("reward", 0.5, step=1)
+        ...     logger.shutdown()
+        ...     logger.path.name
+        'post_train.mcap'
     """
 
     def __init__(self, exp_name: str, log_dir: str | os.PathLike, *, overwrite: bool = False) -> None:

@@ -66,9 +66,17 @@ class Recorder(Transform):
         OSError: as there, from the first step on.
 
     Examples:
-        >>> env = TransformedEnv(TabletopEnv("starter/open_the_top_drawer", 16), Recorder("runs/demo.mcap"))
-        >>> env.rollout(64)
-        >>> env.close()
+        >>> import tempfile
+        >>> from torchrl.envs import TransformedEnv
+        >>> from worldenv_trl.envs import TabletopEnv
+        >>> from worldenv_trl.record import list_rollouts
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     base = TabletopEnv("starter/open_the_top_drawer", 2, seed=0)
+        ...     env = TransformedEnv(base, Recorder(f"{folder}/demo.mcap"))
+        ...     rollout = env.rollout(5)
+        ...     env.close()
+        ...     [info.length for info in list_rollouts(f"{folder}/demo.mcap")]
+        [5, 5]
     """
 
     def __init__(

@@ -84,8 +84,16 @@ class RolloutWriter:
         OSError: if the disk is full, from any method; the partial file keeps what is complete.
 
     Examples:
-        >>> with RolloutWriter("runs/demo.mcap", metadata={"task": "starter/open_the_top_drawer"}) as writer:
-        ...     writer.write(env.rollout(64))
+        >>> import tempfile
+        >>> from worldenv_trl.envs import TabletopEnv
+        >>> from worldenv_trl.record import read_rollouts
+        >>> env = TabletopEnv("starter/open_the_top_drawer", 2, seed=0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with RolloutWriter(f"{folder}/demo.mcap", metadata={"task": "starter/open_the_top_drawer"}) as writer:
+        ...         numbers = writer.write(env.rollout(5))
+        ...     rollouts = read_rollouts(folder, task="starter/open_the_top_drawer", keys=["action", "observation"])
+        >>> numbers, rollouts["observation", "image"].shape
+        ([0, 1], torch.Size([2, 5, 3, 64, 64]))
     """
 
     def __init__(

@@ -85,8 +85,18 @@ def replay(
         FileExistsError: if the new file exists.
 
     Examples:
-        >>> print(replay("runs/demo/rollouts/demonstrations.mcap", 3))
-        >>> print(replay("runs/demo/rollouts/demonstrations.mcap", 3, edits={20: {6: -1.0}}))  # open the hand
+        >>> import tempfile
+        >>> from worldenv_trl.envs import TabletopEnv
+        >>> from worldenv_trl.record import provenance, recorded
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     base = TabletopEnv("starter/open_the_top_drawer", 2, seed=0)
+        ...     env = recorded(base, f"{folder}/demo.mcap", **provenance(base))
+        ...     rollout = env.rollout(8)
+        ...     env.close()
+        ...     again = replay(f"{folder}/demo.mcap", 1)
+        ...     changed = replay(f"{folder}/demo.mcap", 1, edits={3: {2: 1.0}})  # upwards
+        >>> again.exact, changed.kind, changed.divergences[0].step
+        (True, 'what-if', 4)
     """
     source = open_rollout(path, rollout)
     mode = mode or ("imagination" if source.imagined else "physics")
