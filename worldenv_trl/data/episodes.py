@@ -40,6 +40,16 @@ class Episodes:
 
     Raises:
         ValueError: if the numbers of episodes, texts and frames do not go together.
+
+    Examples:
+        >>> from worldenv_trl.data import episodes_from_rollouts
+        >>> from worldenv_trl.envs import TabletopEnv
+        >>> episodes = episodes_from_rollouts(TabletopEnv("starter/open_the_top_drawer", 3, seed=0).rollout(5))
+        >>> episodes["actions"].shape, episodes.instructions[0]
+        (torch.Size([3, 5, 7]), 'open the top drawer of the cabinet')
+        >>> some = Episodes.cat([episodes[:2], episodes[torch.tensor([2, 0])]])
+        >>> some.frames("agentview", torch.arange(4), torch.tensor(5)).shape  # the last one of each
+        torch.Size([4, 3, 64, 64])
     """
 
     def __init__(
@@ -149,12 +159,13 @@ class Episodes:
         self.reading.add(3 * size * size * index.numel(), *self._parts)
         if len(self._parts) == 1:
             return self._parts[0][key][index]
-        out = None
+        out: Tensor | None = None
         for number, frames in enumerate(self._parts):
             here = part == number
             found = frames[key][index[here]]
             out = found.new_empty(*index.shape, *found.shape[1:]) if out is None else out
             out[here] = found
+        assert out is not None  # there is at least one store
         return out
 
     # ------------------------------------------------------------------------------------------------- together

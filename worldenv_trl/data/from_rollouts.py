@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -51,7 +53,11 @@ def episodes_from_rollouts(rollouts: TensorDictBase) -> Episodes:
     present = set(rollouts.keys(True, True))
     decisions = CHUNK in present and ACTION not in present
     cameras = _cameras(rollouts, decisions)
-    needed = [CHUNK if decisions else ACTION, *_ROOT, *(image_key(camera) for camera in cameras)]
+    needed: list[str | tuple[str, ...]] = [
+        CHUNK if decisions else ACTION,
+        *_ROOT,
+        *(image_key(camera) for camera in cameras),
+    ]
     needed += [("next", *_path(key)) for key in (STATES, KINEMATIC_STATES, STEP_MASK)] if decisions else []
     needed += [] if decisions else [("next", *_path(key)) for key in (STATE, KINEMATIC_STATE)]
     missing = [key for key in needed if key not in present]
@@ -145,7 +151,7 @@ def _from_reset(first: Tensor, after: Tensor, length: Tensor) -> Tensor:
     return out
 
 
-def _success(rollouts: TensorDictBase, valid: Tensor, per_step, length: Tensor) -> Tensor:
+def _success(rollouts: TensorDictBase, valid: Tensor, per_step: Callable[[Tensor], Tensor], length: Tensor) -> Tensor:
     """bool [R, T + 1]."""
     after = rollouts["next", SUCCESS].reshape(rollouts.shape)
     before = rollouts.get(SUCCESS, None)

@@ -6,7 +6,7 @@ import io
 import json
 import os
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -150,7 +150,7 @@ def _columns(flat: dict[_Path, Tensor], valid: Tensor) -> list[dict[str, Any]]:
     return columns
 
 
-def _instructions(texts: dict[_Path, Any], shape: tuple[int, int]) -> list[str]:
+def _instructions(texts: dict[_Path, Any], shape: Sequence[int]) -> list[str]:
     value = texts.get((INSTRUCTION,), "")
     if isinstance(value, str):
         return [value] * shape[0]
@@ -222,7 +222,7 @@ class _FolderWriter:
                 np.arange(1, length + 1) == length if after is None else after[:length].reshape(length).bool().numpy(),
             )
         steps = np.arange(length)
-        counters = {
+        counters: dict[str, np.ndarray] = {
             "timestamp": (steps / self.fps).astype(np.float32),
             "frame_index": steps,
             "episode_index": np.full(length, len(self.episodes)),
@@ -316,7 +316,7 @@ class _FolderWriter:
         for column in self.columns:
             if column["image"]:
                 _, height, width = column["shape"]
-                feature = {"dtype": "video" if self.video else "image", "shape": [height, width, 3]}
+                feature: dict[str, Any] = {"dtype": "video" if self.video else "image", "shape": [height, width, 3]}
                 feature["names"] = ["height", "width", "channels"]
                 if self.video:
                     feature["info"] = {

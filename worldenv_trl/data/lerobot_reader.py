@@ -149,6 +149,7 @@ def _tensors(
             if column["chained"]:
                 ended = None if final is None else final[rows[place]["episode_index"]].get(column["name"])
                 whole[place, length] = value[-1] if ended is None else _final_value(ended, column)
+        assert whole is not None  # there is at least one row
         key = tuple(column["key"])
         out[key] = whole[:, :-1].clone()
         if column["chained"]:
@@ -196,7 +197,8 @@ def _video_frames(
     folder: Path, info: dict[str, Any], rows: list[dict[str, Any]], column: dict[str, Any], pq: Any
 ) -> Iterator[Tensor]:
     """Frames [T, 3, H, W] of each episode."""
-    name, open_path, frames, place = column["name"], None, iter(()), 0
+    name, open_path, place = column["name"], None, 0
+    frames: Iterator[np.ndarray] = iter(())
     for row in rows:
         path = folder / info["video_path"].format(
             video_key=name,
@@ -208,7 +210,7 @@ def _video_frames(
             if not path.is_file():
                 raise FileNotFoundError(f"{folder} lacks {path.relative_to(folder)}")
             open_path, frames, place = path, read_video(path), 0
-        shown = []
+        shown: list[np.ndarray] = []
         while place < first + row["length"] and (frame := next(frames, None)) is not None:
             if place >= first:
                 shown.append(frame)

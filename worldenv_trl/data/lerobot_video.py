@@ -16,7 +16,7 @@ def write_video(path: Path, parts: Iterable[np.ndarray], fps: int) -> None:
     """Frames uint8 [T, H, W, 3], part by part: H.264 in RGB at quantiser 0, which loses nothing."""
     av = _av()
     path.parent.mkdir(parents=True, exist_ok=True)
-    stream = None
+    stream: Any = None
     with av.open(str(path), "w") as container:
         place = 0
         for frames in parts:

@@ -66,6 +66,18 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
         ValueError: for recordings that cannot be made into episodes, or of different entries, cameras or sizes, or one
             that is named twice.
         OSError: if the disk has no room for the frames.
+
+    Examples:
+        >>> import tempfile
+        >>> from worldenv_trl.envs import TabletopEnv
+        >>> from worldenv_trl.record import RolloutWriter
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with RolloutWriter(f"{folder}/demo.mcap") as writer:
+        ...         numbers = writer.write(TabletopEnv("starter/open_the_top_drawer", 3, seed=0).rollout(5))
+        ...     (episodes,) = fill_store(f"{folder}/store", [f"{folder}/demo.mcap"])
+        ...     last = episodes.frames("agentview", torch.arange(3), torch.tensor(5))
+        >>> numbers, last.shape
+        ([0, 1, 2], torch.Size([3, 3, 64, 64]))
     """
     if len({Path(path).resolve() for path in recordings}) < len(recordings):
         raise ValueError(f"recordings must be named each once, got {', '.join(map(str, recordings))}")
@@ -130,7 +142,7 @@ def open_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
     except (KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"the episode store {folder} is cut short ({error!r}): {remedy}") from error
     if held != wanted:
-        names = [", ".join(each["name"] for each in side) for side in (held, wanted)]
+        names = [", ".join(str(each["name"]) for each in side) for side in (held, wanted)]
         changed = " as they were before they changed" if names[0] == names[1] else ""
         raise ValueError(
             f"the episode store {folder} belongs to other recordings, {names[0]}{changed}, not {names[1]}: {remedy}"

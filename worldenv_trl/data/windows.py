@@ -212,6 +212,20 @@ def window_buffer(
 
     Raises:
         ValueError: for cameras or frames that are not the model's, episodes without a step, or settings out of range.
+
+    Examples:
+        >>> from worldenv_trl.data import episodes_from_rollouts
+        >>> from worldenv_trl.envs import TabletopEnv
+        >>> from worldenv_trl.objectives import WorldModelLoss
+        >>> from worldenv_trl.world_models import VideoWorldModel, VideoWorldModelConfig
+        >>> env = TabletopEnv("starter/open_the_top_drawer", 2, seed=0)
+        >>> seen_by = {"agentview": {task.language: task.camera("agentview") for task in env.tasks}}
+        >>> model = VideoWorldModel(VideoWorldModelConfig.for_cameras(seen_by, width=16))
+        >>> episodes = episodes_from_rollouts(env.rollout(12))
+        >>> windows = window_buffer(episodes, ForwardKinematics(), model, batch_size=2, chunks=1).sample()
+        >>> windows["frames", "image"].shape, windows["actions"].shape  # remembered and asked for; executed
+        (torch.Size([2, 12, 3, 64, 64]), torch.Size([2, 8, 7]))
+        >>> WorldModelLoss(model)(windows)["loss_world_model"].backward()
     """
     missing = [camera for camera in world_model.cameras if camera not in episodes.cameras]
     if missing:

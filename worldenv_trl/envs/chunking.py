@@ -29,6 +29,13 @@ def chunked(env: EnvBase, chunk_length: int = CHUNK_LENGTH, *, frames: bool = Fa
 
     With ``frames`` it writes what :class:`~worldenv_trl.envs.ImaginedEnv` writes, under the same keys, for every camera
     of ``env``; a :class:`~worldenv_trl.envs.Reflect` goes around ``env`` first, so that it can stop inside a chunk.
+
+    Examples:
+        >>> from worldenv_trl.envs import TabletopEnv
+        >>> env = chunked(TabletopEnv("starter/open_the_top_drawer", 2, cameras=(), max_steps=12, seed=0))
+        >>> rollout = env.rollout(2)  # random chunks
+        >>> rollout["vla_action", "chunk"].shape, rollout["next", "step_mask"].sum(-1).tolist()
+        (torch.Size([2, 2, 8, 7]), [[8, 4], [8, 4]])
     """
     return ChunkedEnv(env, ChunkedActions(chunk_length, frames=frames))
 

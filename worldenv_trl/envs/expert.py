@@ -33,6 +33,11 @@ class ExpertPolicy(TensorDictModuleBase):
         TypeError: if there is no :class:`TabletopEnv` in ``env``.
         ValueError: when it is called with a tensordict that does not show what ``env`` is at: of another number of
             rows, or other tasks, initial states or steps.
+
+    Examples:
+        >>> env = TabletopEnv("starter/open_the_top_drawer", 2, cameras=(), seed=0)
+        >>> env.rollout(200, ExpertPolicy(env), break_when_any_done=False)["next", "success"].any(1).tolist()
+        [[True], [True]]
     """
 
     def __init__(self, env: EnvBase, make_expert: Callable[[Task], Expert] = ScriptedExpert) -> None:
@@ -80,8 +85,8 @@ class ExpertPolicy(TensorDictModuleBase):
         if (
             started.any() and tensordict.get(INSTRUCTION, None) is not None
         ):  # not every step: texts take time to compare
-            for row, (shown, own) in enumerate(zip(instructions_of(tensordict), self._words, strict=True)):
-                if shown != own:
+            for row, (text, words) in enumerate(zip(instructions_of(tensordict), self._words, strict=True)):
+                if text != words:
                     raise ValueError(
-                        f"this expert's env asks to {own!r} in row {row}, the tensordict {shown!r}: {remedy}"
+                        f"this expert's env asks to {words!r} in row {row}, the tensordict {text!r}: {remedy}"
                     )

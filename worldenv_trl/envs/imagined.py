@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import NonTensorStack, TensorDict, TensorDictBase
 from torch import Tensor
@@ -67,6 +69,19 @@ class ImaginedEnv(EnvBase):
     A reset of a whole group draws its next context, the tasks in turn and without replacement while that is possible;
     rows reset while others of their group are running restart their context, so that a group never mixes contexts.
     ``reset(td, set_state=True)`` starts from the contexts in ``td`` [G, N], always with the same noise.
+
+    Examples:
+        >>> from worldenv_trl.envs import TabletopEnv
+        >>> from worldenv_trl.scenes import load_task
+        >>> from worldenv_trl.world_models import VideoWorldModel, VideoWorldModelConfig
+        >>> task = load_task("starter/open_the_top_drawer")
+        >>> seen_by = {"agentview": {task.language: task.camera("agentview")}}
+        >>> model = VideoWorldModel(VideoWorldModelConfig.for_cameras(seen_by, width=16))
+        >>> contexts = TabletopEnv(task, 2, seed=0).reset()
+        >>> env = ImaginedEnv(model, ForwardKinematics(), contexts, [2, 3], max_steps=16)
+        >>> rollouts = env.rollout(2)  # random chunks
+        >>> rollouts["next", "frames", "image"].shape, rollouts["next", "truncated"].all(0).squeeze(-1).tolist()
+        (torch.Size([2, 3, 2, 8, 3, 64, 64]), [[False, True], [False, True], [False, True]])
     """
 
     _supports_set_state = True
@@ -177,7 +192,7 @@ class ImaginedEnv(EnvBase):
             turn[tasks[index]] = turns[-1] + 1
         return [index for _, index in sorted(zip(turns, shuffled, strict=True), key=lambda pair: pair[0])]
 
-    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
         groups, rollouts = self.batch_size
         mask = tensordict.get("_reset", None) if tensordict is not None else None
         if mask is None:
@@ -225,7 +240,7 @@ class ImaginedEnv(EnvBase):
         keys = set() if tensordict is None else set(tensordict.keys(True, True))
         needed = context_keys(self.cameras)
         missing = [key for key in needed if key not in keys]
-        if missing:
+        if tensordict is None or missing:
             raise ValueError(f"reset(set_state=True) needs {needed} in its tensordict; missing: {missing}")
         start = tensordict.select(*needed).to(self.device).flatten(0, 1)[rows]
         size = (3, self.image_size, self.image_size)

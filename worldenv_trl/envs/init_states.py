@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from torch import Tensor
 
 from worldenv_trl.context_ids import UNKNOWN_CONTEXT, context_id, parts_of
 from worldenv_trl.scenes import Task
@@ -47,7 +48,7 @@ class InitStates:
         mode: str = "random",
         count: int = 50,
         init_state_id: int = 0,
-        states: np.ndarray | None = None,
+        states: np.ndarray | Tensor | None = None,
         context_ids: Sequence[int] | None = None,
     ) -> None:
         if mode not in MODES:
@@ -55,14 +56,15 @@ class InitStates:
         if states is None:
             if context_ids is not None:
                 raise ValueError("context_ids names given init_states: pass both or neither")
-            states = task.init_states(split, max(count, init_state_id + 1) if mode == "fixed" else count)
-            context_ids = [context_id(task_id, split, index) for index in range(len(states))]
+            self.states = task.init_states(split, max(count, init_state_id + 1) if mode == "fixed" else count)
+            self.context_ids = [context_id(task_id, split, index) for index in range(len(self.states))]
         else:
-            states = _given_states(task, states)
-            context_ids = [UNKNOWN_CONTEXT] * len(states) if context_ids is None else _numbers(context_ids, states)
-        if not 0 <= init_state_id < len(states):
-            raise ValueError(f"init_state_id must be in [0, {len(states)}), got {init_state_id}")
-        self.task, self.mode, self.states, self.context_ids = task, mode, states, context_ids
+            self.states = _given_states(task, states)
+            unknown = [UNKNOWN_CONTEXT] * len(self.states)
+            self.context_ids = unknown if context_ids is None else _numbers(context_ids, self.states)
+        if not 0 <= init_state_id < len(self.states):
+            raise ValueError(f"init_state_id must be in [0, {len(self.states)}), got {init_state_id}")
+        self.task, self.mode = task, mode
         self.task_id, self.init_state_id = task_id, init_state_id
         # Of the order alone: a function of the task's name, not of its number in the run at hand.
         self._identity = int.from_bytes(hashlib.sha256(task.name.encode()).digest()[:8], "big")

@@ -49,6 +49,17 @@ class Reflect(Transform):
     Raises:
         ValueError: when it is put onto an env that does not show what the reflector looks at; when a reflector's state
             or scores are not of the videos that it was given.
+
+    Examples:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from worldenv_trl.envs import TabletopEnv
+        >>> from worldenv_trl.reflectors import CompactReflector, CompactReflectorConfig
+        >>> base = TabletopEnv("starter/open_the_top_drawer", 2, seed=0)
+        >>> reflector = CompactReflector(CompactReflectorConfig((base.tasks[0].language,)))
+        >>> env = TransformedEnv(base, Reflect(reflector, StopRule(0.99, 2)))
+        >>> rollout = env.rollout(3)
+        >>> rollout["next", "success_prob"].shape, rollout["next", "reward"].abs().sum().item()
+        (torch.Size([2, 3, 1]), 0.0)
     """
 
     def __init__(self, reflector: Reflector, rule: StopRule = StopRule()) -> None:  # noqa: B008 - frozen

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -235,7 +236,7 @@ class TabletopEnv(EnvBase):
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
         return False  # a state is honoured when set_state=True asks for it, never because it happens to be there
 
-    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
         self._check_open()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = np.ones(self.num_envs, bool) if mask is None else mask.reshape(-1).numpy()
@@ -334,15 +335,14 @@ class TabletopEnv(EnvBase):
 
     def _read(self, active: np.ndarray) -> None:
         """Brings what ``active`` rows show up to date."""
-        parts = [(block, np.flatnonzero(active[block.rows])) for block in self._blocks]
-        parts = [(block, local) for block, local in parts if len(local)]
-        scenes = [block.scene for block, _ in parts]
+        parts = [(block, local) for block in self._blocks if len(local := np.flatnonzero(active[block.rows]))]
         if not parts:
             return
         finish = None
         if self._pool is not None:
             poses = [block.scene.poses(local) for block, local in parts]
-            finish = self._pool.start([scene.drawing for scene in scenes], poses)
+            drawings = [block.scene.drawing for block, _ in parts if block.scene.drawing is not None]
+            finish = self._pool.start(drawings, poses)
         try:
             self._read_state(parts)  # while the images are drawn
         finally:
@@ -364,7 +364,7 @@ class TabletopEnv(EnvBase):
 
     def _observe(self) -> TensorDictBase:
         """A copy of what all rows show, and whether they have ended."""
-        copies = {image_entry(name): image.copy() for name, image in self._images.items()}
+        copies: dict[str, np.ndarray] = {image_entry(name): image.copy() for name, image in self._images.items()}
         copies["state"] = self._state.copy()
         out = {
             "observation": {name: torch.from_numpy(value) for name, value in copies.items()},

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Self
+
 import pytorch_kinematics as pk
 import torch
 from torch import Tensor, nn
@@ -53,7 +56,7 @@ class ForwardKinematics(nn.Module):
             self.register_buffer(name, torch.as_tensor(values, dtype=torch.float32), persistent=False)
         self.register_buffer("_damping", self.damping**2 * torch.eye(6), persistent=False)
 
-    def _apply(self, fn, recurse: bool = True):
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         super()._apply(fn, recurse)  # the chain is not a module: move it along
         self._chain = self._chain.to(dtype=self._joint_low.dtype, device=self._joint_low.device)
         return self

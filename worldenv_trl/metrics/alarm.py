@@ -47,6 +47,13 @@ class HonestyAlarm:
 
     Raises:
         ValueError: for a rate outside (0, 1), or counts out of range.
+
+    Examples:
+        >>> alarm = HonestyAlarm(probes=2)
+        >>> alarm.update(imagined=[False] * 16, real=[False] * 16).fired  # the first probe: nothing to compare with
+        False
+        >>> alarm.update(imagined=[True] * 16, real=[False] * 16).fired
+        True
     """
 
     def __init__(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from html import escape
 
 import torch
@@ -113,14 +114,15 @@ def strip_svg(clip: Clip, number: int, every: int = 8) -> str:
     return "".join([*out, "</svg>"])
 
 
-def _events(clip: Clip, px, top: float) -> list[str]:
+def _events(clip: Clip, px: Callable[[float], float], top: float) -> list[str]:
     """Marks of what happens: the goal, the stop, where the videos part; words that would overlap share a line less."""
     events = [
         (clip.reached, "goal", "good"),
         (clip.imagined_stop, "stop", "imagined"),
         (clip.parting, "parts", "bad"),
     ]
-    out, taken = [], []
+    out: list[str] = []
+    taken: list[float] = []
     for step, words, colour in sorted(event for event in events if event[0] >= 0):
         x = px(step)
         level = 0 if all(abs(x - other) > 66 for other in taken) else 1

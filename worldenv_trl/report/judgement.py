@@ -64,8 +64,8 @@ def _calibration_card(evidence: Evidence) -> str:
     series, rows = [], []
     for name, (probability, label) in evidence.scores.items():
         found = calibration(probability, label)
-        values = [[entry[key] for entry in found] for key in ("mean", "rate", "low", "high")]
-        series.append(Series(_NAMES[name], name, *values, dots=True))
+        mean, rate, low, high = ([entry[key] for entry in found] for key in ("mean", "rate", "low", "high"))
+        series.append(Series(_NAMES[name], name, mean, rate, low, high, dots=True))
         rows += [
             (
                 _NAMES[name],

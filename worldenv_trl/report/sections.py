@@ -176,8 +176,8 @@ def drift(evidence: Evidence | None) -> str:
         for index, (policy, figures) in enumerate(evidence.drift.items()):
             colour = "before" if index == 0 and len(evidence.drift) > 1 else "imagined"
             x = figures["horizon"].tolist()
-            bounds = [figures[f"{key}_{end}"].tolist() for end in ("low", "high")]
-            series.append(Series(f"imagined, {policy}", colour, x, figures[key].tolist(), *bounds))
+            low, high = (figures[f"{key}_{end}"].tolist() for end in ("low", "high"))
+            series.append(Series(f"imagined, {policy}", colour, x, figures[key].tolist(), low, high))
             legend.append((f"imagined, {policy}", colour))
         series.append(Series("copy of the first frame", "plain", x, figures[f"copy_{key}"].tolist(), dashed=True))
         legend.append(("copy of the first frame", "dashed"))

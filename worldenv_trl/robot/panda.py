@@ -7,6 +7,7 @@ Gaz et al., "Dynamic Identification of the Franka Emika Panda Robot", RA-L 2019.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,10 +77,12 @@ def urdf() -> str:
     return "\n".join([*text, "</robot>"])
 
 
-def _urdf_joint(name, kind, parent, child, xyz, rpy, extra="") -> str:
+def _urdf_joint(
+    name: str, kind: str, parent: str, child: str, xyz: Sequence[float], rpy: Sequence[float], extra: str = ""
+) -> str:
     pose = f'<origin xyz="{_numbers(xyz)}" rpy="{_numbers(rpy)}"/>'
     return f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{pose}{extra}</joint>'
 
 
-def _numbers(values) -> str:
+def _numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values)

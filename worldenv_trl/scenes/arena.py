@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from dm_control import composer, mjcf
 
 from worldenv_trl.robot import WRIST, Camera, look_at
@@ -71,7 +73,7 @@ class TabletopArena:
         on_tool = tuple(camera for camera in cameras if camera.mount == "tool")
         self.attach(Panda("panda", on_tool), pos=BASE_POSITION)
 
-    def attach(self, entity: composer.Entity, pos=(0.0, 0.0, 0.0)) -> None:
+    def attach(self, entity: composer.Entity, pos: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         """Fixes an entity to the world."""
         self.root.worldbody.add("site", pos=pos, size=(0.001,), rgba=(0, 0, 0, 0)).attach(entity.mjcf_model)
 

@@ -287,7 +287,7 @@ class _Parser:
 
     def _yaw(self, region: str, part: _List | None) -> tuple[float, float]:
         rows = self._rows(part, 2)
-        if len(rows) > 1:
+        if part is not None and len(rows) > 1:
             raise self.error(part, f"region {region!r} takes one (low high) of :yaw_rotation, got {len(rows)}")
         if not rows:
             return 0.0, 0.0

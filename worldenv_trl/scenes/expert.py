@@ -62,7 +62,8 @@ class ScriptedExpert:
         self._ends = list(accumulate(len(stage.phases) for stage in self._stages))
         self.phases = [phase for stage in self._stages for phase in stage.phases]
         self.phase: np.ndarray | None = None
-        self._warn, self._said = warn, set()  # stages that were said to be out of reach
+        self._warn = warn
+        self._said: set[int] = set()  # stages that were said to be out of reach
 
     def reset(self, rows: np.ndarray | None = None) -> None:
         """Starts ``rows`` (default: all) from the first phase."""

@@ -11,7 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -165,7 +165,8 @@ def save_poses(task: FileTask, path: Path, count: int, check: Check | None = Non
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with unfinished.open("wb") as file:
-            np.savez_compressed(file, digest=np.str_(task.digest), seed=np.int64(task.seed), **poses)
+            arrays: dict[str, Any] = {"digest": np.str_(task.digest), "seed": np.int64(task.seed), **poses}
+            np.savez_compressed(file, **arrays)
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)

@@ -110,10 +110,10 @@ class Layout:
             placed |= {item[0] for item in ready}
             waiting = [item for item in waiting if item not in ready]
         self._carried = ordered
-        lost = [name for name in self.entities if name not in placed]
-        if lost:
-            message = f"it has no place in :init: say where it starts, (On {lost[0]} <region>)"
-            raise self.problem.error("thing", lost[0], message=message)
+        missing = [name for name in self.entities if name not in placed]
+        if missing:
+            message = f"it has no place in :init: say where it starts, (On {missing[0]} <region>)"
+            raise self.problem.error("thing", missing[0], message=message)
 
     # ------------------------------------------------------------------------------------------------- drawing
 
@@ -148,7 +148,7 @@ class Layout:
 
     def _hardest(self, failures: Counter[tuple[str, str, str]]) -> tuple[str, str, str]:
         """Of what failed: the thing that did so in the largest share of the tries that came as far as to it."""
-        left, worst, found = failures.total(), 0.0, None
+        left, worst, found = failures.total(), 0.0, next(iter(failures))
         for thing, _ in self._on_table:
             mine = Counter({failed: count for failed, count in failures.items() if failed[0] == thing})
             if mine.total() > worst * left:
@@ -219,4 +219,4 @@ def _reach(spot: _Placed, axis: np.ndarray) -> float:
     if spot.round:
         return spot.half[0]
     cos, sin = math.cos(spot.yaw), math.sin(spot.yaw)
-    return abs(axis @ (cos, sin)) * spot.half[0] + abs(axis @ (-sin, cos)) * spot.half[1]
+    return float(abs(axis @ (cos, sin)) * spot.half[0] + abs(axis @ (-sin, cos)) * spot.half[1])

@@ -40,7 +40,7 @@ def main(memory: int, tickets: int) -> None:
             canvas.draw(*shared.pose(row), [image[row] for image in shared.images])
         os.write(reports, ticket)
 
-    orders, poll = sys.stdin.buffer.raw, select.poll()
+    orders, poll = sys.stdin.buffer.raw, select.poll()  # type: ignore[union-attr] # a pipe, which has one
     poll.register(orders, select.POLLIN)
     poll.register(tickets, select.POLLIN)
     unread = b""

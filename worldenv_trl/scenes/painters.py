@@ -121,7 +121,9 @@ class Helper:
         except BaseException:
             self._log.close()
             raise
-        self.pid, self.reports = self._process.pid, self._process.stdout.fileno()
+        assert self._process.stdin is not None and self._process.stdout is not None  # pipes
+        self._orders, self._said = self._process.stdin, self._process.stdout
+        self.pid, self.reports = self._process.pid, self._said.fileno()
         self.due = 0  # drawings that it has been given but has not yet reported to hold
 
     def add(self, layout: Layout) -> None:
@@ -141,7 +143,7 @@ class Helper:
 
     def stop(self, patience: float = 0.0) -> str:
         """Ends the process, which is given ``patience`` (s) to do so itself; what it said last, or how it ended."""
-        for file in (self._process.stdin, self._process.stdout):
+        for file in (self._orders, self._said):
             with contextlib.suppress(OSError):
                 file.close()
         try:
@@ -156,4 +158,4 @@ class Helper:
 
     def _write(self, data: bytes) -> None:
         while data:
-            data = data[self._process.stdin.write(data) :]
+            data = data[self._orders.write(data) :]

@@ -57,11 +57,11 @@ class PerturbedExpert:
     ) -> None:
         chances = {"gripper_flips": gripper_flips, "early_release": early_release, "wrong_object": wrong_object}
         for name, value in chances.items():
-            if not isinstance(value, Real) or not 0.0 <= value <= 1.0:
+            if not _is_number(value) or not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} is a probability, got {value!r}: pass a number from 0 to 1")
-        if not isinstance(noise, Real) or not 0.0 <= noise < math.inf:
+        if not _is_number(noise) or not 0.0 <= noise < math.inf:
             raise ValueError(f"noise must be a finite number and not negative, got {noise!r}")
-        if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
+        if not _is_number(seed, Integral) or isinstance(seed, bool) or seed < 0:
             raise ValueError(f"seed must be a whole number of at least 0, got {seed!r}")
         self.noise, self.gripper_flips, self.early_release = noise, gripper_flips, early_release
         self.wrong_object, self.seed = wrong_object, seed
@@ -121,6 +121,10 @@ class PerturbedExpert:
             self._flipped[row] = (self._flipped[row] + 1) % _FLIPPED
             action[6] = -action[6]
         action[:6] += self.noise * rng.standard_normal(ACTION_DIM - 1)
+
+
+def _is_number(value: object, kind: type = Real) -> bool:
+    return isinstance(value, kind)
 
 
 def _wrong_goal(task: FileTask) -> list[tuple[str, ...]]:

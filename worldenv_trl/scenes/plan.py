@@ -6,6 +6,7 @@ import difflib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -63,7 +64,7 @@ def plan_stages(task: FileTask, goal: Sequence[tuple[str, ...]]) -> list[Stage]:
     return stages
 
 
-def _check_goal(task: FileTask, goal: Sequence[tuple[str, ...]]) -> None:
+def _check_goal(task: FileTask, goal: Any) -> None:
     """Raises ``TypeError`` or ``ValueError`` for a goal that cannot be asked of the task's things."""
     example = "goal=[('On', 'bowl_1', 'plate_1')]"
     if isinstance(goal, str) or not isinstance(goal, Sequence):
@@ -84,8 +85,8 @@ def _check_goal(task: FileTask, goal: Sequence[tuple[str, ...]]) -> None:
         for name in names:
             if name not in known:
                 raise ValueError(f"no script for {task.name}: it has no thing or region {name!r}{_hint(name, known)}")
-        if predicate in ("On", "In") and (message := task.relations.why_not(*aim)):
-            raise ValueError(f"no script for {task.name}: ({' '.join(aim)}): {message}")
+        if predicate in ("On", "In") and (why := task.relations.why_not(*aim)):
+            raise ValueError(f"no script for {task.name}: ({' '.join(aim)}): {why}")
 
 
 def _hint(word: str, known: Iterable[str]) -> str:

@@ -37,7 +37,7 @@ def inside(points: np.ndarray, center: np.ndarray, rotation: np.ndarray, half_si
     """``[n]``: points ``[n, 3]`` are in the boxes, or at most a centimetre below their floor."""
     local = _local(points, center, rotation)
     low = -np.array(half_size) - (0.0, 0.0, SINKS)
-    return ((low < local) & (local < half_size)).all(-1)
+    return np.all((low < local) & (local < half_size), -1)
 
 
 def _local(points: np.ndarray, center: np.ndarray, rotation: np.ndarray) -> np.ndarray:
@@ -163,7 +163,7 @@ class Relations:
         touching = np.zeros_like(rows)
         roots = [self.model.body(f"{name}/").id for name in (first, second)]
         for row in np.flatnonzero(rows):
-            scene.load(self._data, row)
+            scene.load(self._data, int(row))
             mujoco.mj_kinematics(self.model, self._data)
             mujoco.mj_comPos(self.model, self._data)
             mujoco.mj_collision(self.model, self._data)

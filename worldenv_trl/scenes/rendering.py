@@ -151,7 +151,8 @@ class _Crew:
     """The helpers of a pool, the file they share with it, and the pipe that brings them work."""
 
     def __init__(self, size: int) -> None:
-        self.size, self.shared = size, {}  # number of a drawing: its part of the file
+        self.size = size
+        self.shared: dict[int, SharedRows] = {}  # number of a drawing: its part of the file
         self._helpers: list[Helper] = []
         self._memory = self.tickets = self._write_end = -1
         self._end = 0

@@ -14,7 +14,7 @@ from mujoco.batch import Batch
 from worldenv_trl.robot import panda
 from worldenv_trl.scenes import controller
 from worldenv_trl.scenes.panda import SUBSTEPS
-from worldenv_trl.scenes.rendering import RendererPool, Row
+from worldenv_trl.scenes.rendering import Drawing, RendererPool, Row
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.tasks import Task
@@ -56,7 +56,7 @@ class SceneBatch:
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        if not isinstance(image_size, Integral) or not 16 <= image_size <= _LARGEST_IMAGE:
+        if not _is_whole(image_size) or not 16 <= image_size <= _LARGEST_IMAGE:
             raise ValueError(f"image_size must be a whole number from 16 to {_LARGEST_IMAGE} px, got {image_size!r}")
         self.task, self.num_envs, self.image_size = task, num_envs, int(image_size)
         self.model = task.build()
@@ -77,13 +77,14 @@ class SceneBatch:
         self._mocap_pos, self._mocap_quat = self.batch.bind("mocap_pos"), self.batch.bind("mocap_quat")
         self.xpos, self.xmat = self.batch.bind("xpos"), self.batch.bind("xmat")
         self.site_xpos, self.site_xmat = self.batch.bind("site_xpos"), self.batch.bind("site_xmat")
-        self.cameras, self.drawing = tuple(cameras), None
+        self.cameras = tuple(cameras)
+        self.drawing: Drawing | None = None
+        self._own_pool: RendererPool | None = None
         if cameras:
-            self._own_pool = RendererPool(min(threads, num_envs)) if pool is None else None
+            if pool is None:
+                pool = self._own_pool = RendererPool(min(threads, num_envs))
             names = [known[name] for name in cameras]
-            self.drawing = (pool or self._own_pool).add(
-                self.model, names, self.image_size, num_envs, task.glows(self.model)
-            )
+            self.drawing = pool.add(self.model, names, self.image_size, num_envs, task.glows(self.model))
 
     def reset(self, rows: np.ndarray, sim_state: np.ndarray) -> None:
         """Puts ``rows [k]`` into integration states ``sim_state [k, S]``, exactly.
@@ -143,8 +144,8 @@ class SceneBatch:
 
     def poses(self, rows: np.ndarray | None = None) -> list[Row]:
         """Where everything is in ``rows`` (copies), for a renderer."""
-        rows = slice(None) if rows is None else rows
-        copies = (np.array(field[rows]) for field in (self.qpos, self._mocap_pos, self._mocap_quat))
+        chosen = slice(None) if rows is None else rows
+        copies = (np.array(field[chosen]) for field in (self.qpos, self._mocap_pos, self._mocap_quat))
         return list(zip(*copies, strict=True))
 
     def measured_state(self) -> np.ndarray:
@@ -229,6 +230,10 @@ def cameras_of(task: Task) -> dict[str, str]:
     model = task.build()
     names = [model.camera(index).name for index in range(model.ncam)]
     return {name.removeprefix("panda/"): name for name in names}
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, Integral)
 
 
 def _joint_address(model: mujoco.MjModel, name: str) -> int:

@@ -48,6 +48,26 @@ class WorldModel(TensorDictModuleBase, abc.ABC):
         image_size: height and width of the frames (px).
         chunk_length: C.
         instructions: those it is trained on; others are answered with a warning.
+
+    Examples:
+        >>> class Still(WorldModel):  # remembers the last frame, and believes that nothing ever moves
+        ...     def memory_indices(self, now):
+        ...         return now.unsqueeze(-1)
+        ...
+        ...     def forward(self, tensordict):
+        ...         for camera in self.cameras:
+        ...             last = tensordict[memory_key(camera)]
+        ...             tensordict[frames_key(camera)] = last.expand(-1, self.chunk_length, -1, -1, -1).clone()
+        ...         return tensordict
+        >>> model = Still(image_size=16, chunk_length=4)
+        >>> frames = {"image": torch.zeros(2, 9, 3, 16, 16, dtype=torch.uint8)}
+        >>> videos = TensorDict({"frames": frames, "poses": torch.zeros(2, 9, 13)}, [2, 9])
+        >>> row, now = torch.arange(2).unsqueeze(-1), torch.tensor([0, 5])
+        >>> poses, actions = torch.zeros(2, 4, 13), torch.zeros(2, 4, 7)
+        >>> texts = ["open the drawer", "turn on the stove"]
+        >>> asked = request(model, lambda number: videos[row, number], now, poses, actions, texts)
+        >>> model(asked)["frames", "image"].shape
+        torch.Size([2, 4, 3, 16, 16])
     """
 
     def __init__(

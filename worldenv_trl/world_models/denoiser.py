@@ -156,14 +156,14 @@ class Denoiser(nn.Module):
     def _trunk(self, trunk: Tensor, embedding: Tensor) -> Tensor:
         skips = []
         for level, blocks in enumerate(self.down):
-            for block in blocks:
+            for block in blocks:  # type: ignore[attr-defined] # a ModuleList in a ModuleList
                 trunk = block(trunk, embedding)
             if level < len(self.shrink):
                 skips.append(trunk)
                 trunk = self.shrink[level](trunk)
         for level in reversed(range(len(self.up))):
             trunk = skips[level] + F.interpolate(self.grow[level](trunk), scale_factor=2, mode="nearest")
-            for block in self.up[level]:
+            for block in self.up[level]:  # type: ignore[attr-defined] # the same
                 trunk = block(trunk, embedding)
         return trunk
 
@@ -218,8 +218,8 @@ class _Block(nn.Module):
         self.first = nn.Conv2d(channels, channels, 3, padding=1)
         self.modulation = nn.Linear(embedding_dim, 2 * channels)
         self.second = nn.Conv2d(channels, channels, 3, padding=1)
-        nn.init.zeros_(self.second.weight)
-        nn.init.zeros_(self.second.bias)
+        for parameter in self.second.parameters():
+            nn.init.zeros_(parameter)
 
     def forward(self, features: Tensor, embedding: Tensor) -> Tensor:
         scale, shift = self.modulation(embedding)[..., None, None].chunk(2, 1)

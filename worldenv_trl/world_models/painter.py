@@ -35,6 +35,8 @@ class Painter(nn.Module):
         hidden_channels: of the layer in between.
     """
 
+    _base: Tensor
+
     def __init__(self, image_size: int, patch: int, in_channels: int, hidden_channels: int) -> None:
         super().__init__()
         self.patch = patch
@@ -42,6 +44,7 @@ class Painter(nn.Module):
         self.paint = nn.Conv2d(hidden_channels, (_CANDIDATES + 3 + 2) * patch**2, 1)  # weights, colour, flow
         nn.init.zeros_(self.paint.weight)
         with torch.no_grad():
+            assert self.paint.bias is not None
             self.paint.bias.zero_()
             self.paint.bias[: patch**2] = 2.0  # starts as a copy of the last frame
         self.hand = nn.Parameter(torch.zeros(1, 2 * 4, *_HAND_TEXELS))  # closed and open: colour, weight

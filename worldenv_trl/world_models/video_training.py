@@ -61,7 +61,7 @@ def video_loss(model: VideoWorldModel, windows: TensorDictBase) -> TensorDict:
     noised = torch.rand(count, device=device) < noise_prob
     shown = window  # what the next chunk remembers: real frames, or the model's own
     reference = _stacked(model, window.recall(torch.zeros(count, 1, dtype=torch.int64, device=device)))
-    total = weight = 0.0
+    total = weight = torch.zeros((), device=device)
     sums = torch.zeros(4, device=device)
     for chunk in range(window.steps // length):
         now, offset = window.start + chunk * length, torch.arange(1, length + 1, device=device)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -160,7 +160,7 @@ class VideoWorldModel(WorldModel, Pretrained):
         side = config.image_size // config.patch
         self.action_maps = torch.nn.ModuleList(ActionMap(view.distinct, side) for view in self._views)
         chunk = config.chunk_length
-        self.denoiser = Denoiser(
+        self.denoiser = Denoiser(  # type: ignore[call-overload] # PyTorch does not declare memory_format
             views=len(self.cameras),
             chunk_length=chunk,
             memory_frames=_MEMORY,
@@ -229,7 +229,8 @@ class VideoWorldModel(WorldModel, Pretrained):
     @torch.no_grad()
     def _view(self, index: int, tensordict: TensorDictBase, every: Tensor, texts: Sequence[str]) -> View:
         """What one camera shows; ``every`` [B, M + C, 13] are the poses of memory and chunk."""
-        camera, calibrations, action_map = self.cameras[index], self._views[index], self.action_maps[index]
+        camera, calibrations = self.cameras[index], self._views[index]
+        action_map = cast(ActionMap, self.action_maps[index])
         which = calibrations.indices(texts)  # [B]
         mounted = calibrations.mounted[which].to(every.device).view(-1, 1, 1)
         which, poses, size = which.to(every.device), every[:, _MEMORY:], self.image_size

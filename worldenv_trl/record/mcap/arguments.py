@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from numbers import Integral, Real
+from typing import Any
 
 __all__ = ["check_arguments"]
 
@@ -13,7 +14,9 @@ _TIME = "two numbers, the first and the last second"
 _ROLLOUTS = "a number, a slice or a list of numbers"
 
 
-def check_arguments(path, task=None, rollouts=None, time=None, steps=None, keys=None) -> None:
+def check_arguments(
+    path: Any, task: Any = None, rollouts: Any = None, time: Any = None, steps: Any = None, keys: Any = None
+) -> None:
     """Raises TypeError or ValueError for arguments of :func:`read_rollouts` that make no sense."""
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"path must be a file, a folder or a pattern, got {path!r}")

@@ -25,6 +25,7 @@ __all__ = ["PERIOD_NS", "RolloutEncoder"]
 
 PERIOD_NS = 1_000_000_000 // CONTROL_HZ
 _Path = tuple[str, ...]
+_Numbers = Sequence[int] | np.ndarray
 
 
 class RolloutEncoder:
@@ -44,7 +45,7 @@ class RolloutEncoder:
         """How long (ns) a rollout of so many entries plays, with the reset."""
         return (steps * self.layout.steps_per_entry + 1) * PERIOD_NS
 
-    def reset(self, rollouts: Sequence[int], starts: Sequence[int], values: Mapping[_Path, Tensor]) -> None:
+    def reset(self, rollouts: _Numbers, starts: _Numbers, values: Mapping[_Path, Tensor]) -> None:
         """The first observations [n, ...] of rollouts."""
         numbers, times = np.asarray(rollouts, np.int64), np.asarray(starts, np.int64)
         chained = [to_bytes(values[e.key]) for e in self.layout.numbers if e.chained]
@@ -55,9 +56,7 @@ class RolloutEncoder:
             if entry.stored in ("chained", "last_of_frames"):
                 self._images(entry, values[entry.key], times, numbers)
 
-    def steps(
-        self, rollouts: Sequence[int], steps: Sequence[int], starts: Sequence[int], values: Mapping[_Path, Tensor]
-    ) -> None:
+    def steps(self, rollouts: _Numbers, steps: _Numbers, starts: _Numbers, values: Mapping[_Path, Tensor]) -> None:
         """Entries [n, ...], root and next: the ``steps[i]``-th of rollout ``rollouts[i]``, which began at
         ``starts[i]``."""
         period = self.layout.steps_per_entry * PERIOD_NS

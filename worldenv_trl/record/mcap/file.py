@@ -9,9 +9,9 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -83,7 +83,7 @@ class McapFile:
         self._call(self._writer.start, "worldenv_trl")
         self.flush()
 
-    def _open_locked(self):
+    def _open_locked(self) -> BinaryIO:
         while True:
             known = self.partial.exists()
             file = open(self.partial, "ab")  # noqa: SIM115 - closed by close() or abort(); "a": nothing is lost yet
@@ -139,7 +139,7 @@ class McapFile:
         """
         return self._call(self._writer.block, channel, times_ns, rollouts, size)
 
-    def add(self, channel: int, time_ns: int, data: bytes, rollout: int) -> None:
+    def add(self, channel: int, time_ns: int, data: bytes | memoryview, rollout: int) -> None:
         """One message."""
         body = self.block(channel, np.array([time_ns]), np.array([rollout]), len(data))
         body[0] = np.frombuffer(data, np.uint8)
@@ -166,14 +166,14 @@ class McapFile:
         if self.flush_is_due:
             self.flush()
 
-    def _call(self, method, *arguments) -> Any:
+    def _call(self, method: Callable[..., Any], *arguments: Any) -> Any:
         if self.closed:
             raise ValueError(f"the writer of {self.path} is closed")
         try:
             return method(*arguments)
         except OSError as error:
             self.abort()
-            hint = _HINTS.get(error.errno, f" ({error.strerror})")
+            hint = _HINTS.get(error.errno or 0, f" ({error.strerror})")
             raise OSError(
                 error.errno, f"{self.path} could not be written{hint}; what is complete is in {self.partial}"
             ) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import mmap
 import struct
 import zlib
 from dataclasses import dataclass, field
@@ -51,7 +52,7 @@ class FileIndex:
     attachments: list[AttachmentIndex] = field(default_factory=list)
 
 
-def read_index(data: bytes, size: int) -> FileIndex | None:
+def read_index(data: bytes | mmap.mmap, size: int) -> FileIndex | None:
     """The index of a file of ``size`` bytes; None if it is missing, damaged or (which is allowed) not complete."""
     footer = size - 8 - _FOOTER.size
     if footer < 8 or data[size - 8 : size] != MAGIC:

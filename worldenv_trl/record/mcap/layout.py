@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -139,10 +140,10 @@ def same_camera(key: tuple[str, ...]) -> tuple[str, ...] | None:
     return (other, key[1]) if other is not None and len(key) == 2 else None
 
 
-def leaves(rollouts: TensorDictBase) -> tuple[dict[tuple[str, ...], Tensor], dict[tuple[str, ...], list]]:
+def leaves(rollouts: TensorDictBase) -> tuple[dict[tuple[str, ...], Tensor], dict[tuple[str, ...], list | str]]:
     """The tensors by path, and the texts by path as nested lists [*B, T] (or one string for all)."""
     tensors: dict[tuple[str, ...], Tensor] = {}
-    texts: dict[tuple[str, ...], list] = {}
+    texts: dict[tuple[str, ...], list | str] = {}
 
     def walk(part: TensorDictBase, above: tuple[str, ...]) -> None:
         for name in part.keys():  # noqa: SIM118 - a TensorDict iterates over rows
@@ -215,7 +216,7 @@ def _check_storable(flat: dict[tuple[str, ...], Tensor]) -> None:
             raise ValueError(f"the image {key} would be on the topic /{name} of a recording: call it something else")
 
 
-def _replace(entry: Entry, **changes) -> Entry:
+def _replace(entry: Entry, **changes: Any) -> Entry:
     return Entry(**asdict(entry) | changes)
 
 
@@ -240,7 +241,7 @@ def _is_chained(root: Tensor, after: Tensor, valid: Tensor) -> bool:
 def _name_images(images: list[Entry], flat: dict[tuple[str, ...], Tensor], valid: Tensor) -> list[Entry]:
     """Decides how the images of decisions are kept, and their topics."""
     chained = {entry.key for entry in images if entry.stored == "chained"}
-    pairs = {key: same_camera(key) for key in chained if key[0] != FRAMES and same_camera(key) in chained}
+    pairs = {key: other for key in chained if key[0] != FRAMES and (other := same_camera(key)) in chained}
     image_of = {frames: key for key, frames in pairs.items() if _last_frames_match(flat, valid, key, frames)}
     named = []
     for entry in images:

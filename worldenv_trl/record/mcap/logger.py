@@ -53,9 +53,13 @@ class MCAPLogger(Logger):
         OSError: from :meth:`shutdown`, if the file could not be completed.
 
     Examples:
-        >>> logger = MCAPLogger("post_train", "runs/demo")
-        >>> logger.log_scalar("reward", 0.5, step=1)
-        >>> logger.shutdown()
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     logger = MCAPLogger("post_train", folder)
+        ...     logger.log_scalar("reward", 0.5, step=1)
+        ...     logger.shutdown()
+        ...     logger.path.name
+        'post_train.mcap'
     """
 
     def __init__(self, exp_name: str, log_dir: str | os.PathLike, *, overwrite: bool = False) -> None:
@@ -159,7 +163,9 @@ class MCAPLogger(Logger):
         if values:
             self.experiment.write_metadata("hparams", values)
 
-    def log_histogram(self, name: str, data: Sequence, *, step: int | None = None, bins: int = 32, **_: Any) -> None:
+    def log_histogram(
+        self, name: str, data: Sequence | Tensor, *, step: int | None = None, bins: int = 32, **_: Any
+    ) -> None:
         """A histogram as JSON on ``/<name>``: ``counts`` [bins], ``edges`` [bins + 1], ``step``."""
         values = np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data, dtype=np.float64).ravel()
         counts, edges = np.histogram(values, bins=bins)

@@ -88,8 +88,7 @@ class Part:
         resets = [messages.get(f"{self.prefix}/reset", []) for messages in rollouts]
         have = [len(each) for each in steps]
         if complete and (have != self.lengths or any(len(each) != 1 for each in resets)):
-            rollouts, found = (sum(map(bool, resets)), self.rows), (sum(have), sum(self.lengths))
-            raise lacks_messages(self.file, rollouts, found)
+            raise lacks_messages(self.file, (sum(map(bool, resets)), self.rows), (sum(have), sum(self.lengths)))
         if not complete:
             have = [self._leading(*each) for each in zip(steps, resets, self.starts, self.lengths, strict=True)]
         self._decode_numbers(resets, steps, have, wanted)
@@ -137,11 +136,10 @@ class Part:
         first = layout.reset_message().unpack([resets[row][0][1] for row in begun])[1:]
         flat = [data for each, count in zip(steps, have, strict=True) for _, data in each[:count]]
         values = layout.step_message().unpack(flat)
-        row = np.repeat(np.arange(rows), have)
-        step = np.concatenate([np.arange(count) for count in have] or [np.zeros(0, np.int64)])
-        if len(flat) and (np.ascontiguousarray(values[1]).view(np.int64)[:, 0] != step).any():
+        steps_of = np.concatenate([np.arange(count) for count in have] or [np.zeros(0, np.int64)])
+        if len(flat) and (np.ascontiguousarray(values[1]).view(np.int64)[:, 0] != steps_of).any():
             raise ValueError(f"the steps in {self.file} are out of order")
-        row, step = torch.from_numpy(row), torch.from_numpy(step)
+        row, step = torch.from_numpy(np.repeat(np.arange(rows), have)), torch.from_numpy(steps_of)
         start = {e.key: raw for e, raw in zip((e for e in layout.numbers if e.chained), first, strict=True)}
         for entry, raw in zip(layout.numbers, values[2:], strict=True):
             if not wanted(entry.key) and entry.key != (STEP_MASK,):
@@ -157,7 +155,8 @@ class Part:
     # --------------------------------------------------------------------------------------------- images
 
     def _needed(self, entry: Entry, wanted: Callable[[_Path], bool]) -> bool:
-        return wanted(entry.key) or (self.layout.splits(entry) and wanted(same_camera(entry.key)))
+        other = same_camera(entry.key)
+        return wanted(entry.key) or (other is not None and self.layout.splits(entry) and wanted(other))
 
     def _decode_images(self, topic: str, rollouts: list[Found], have: list[int], complete: bool) -> None:
         entries = [e for e in self.layout.images if e.topic == topic]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -71,7 +72,7 @@ class FixedMessage:
             messages[:, place] = value
         return messages
 
-    def unpack(self, messages: list[bytes]) -> list[np.ndarray]:
+    def unpack(self, messages: Sequence[bytes | memoryview]) -> list[np.ndarray]:
         """The fields' raw bytes, uint8 [n, nbytes of the field] each.
 
         Raises:
@@ -103,7 +104,7 @@ class FixedMessage:
         return _bytes_field(1, file)
 
 
-def image_data(message: bytes) -> tuple[int, int, int]:
+def image_data(message: bytes | memoryview) -> tuple[int, int, int]:
     """Width, height and where the pixels start in a serialised ``foxglove.RawImage``.
 
     Raises:
@@ -162,7 +163,7 @@ def varint(value: int) -> bytes:
     return bytes(out)
 
 
-def _read_varint(message: bytes, position: int) -> tuple[int, int]:
+def _read_varint(message: bytes | memoryview, position: int) -> tuple[int, int]:
     value = shift = 0
     while True:
         byte = message[position]

@@ -69,7 +69,8 @@ def read_rollouts(
         ValueError: for a file that is no MCAP, without messages that it should hold, or not written by this package
             or by a later release of it; for files whose entries differ; if ``task``, a rollout or a key is not in them.
     """
-    rollouts = rollouts.tolist() if hasattr(rollouts, "tolist") else rollouts  # arrays and tensors
+    if rollouts is not None and hasattr(rollouts, "tolist"):  # arrays and tensors
+        rollouts = rollouts.tolist()
     check_arguments(path, task, rollouts, time, steps, keys)
     recordings = _recordings(path, replays)
     if task is not None:
@@ -143,7 +144,9 @@ def _path(key: _Key) -> _Path:
     return (key,) if isinstance(key, str) else tuple(key)
 
 
-def _chosen(recordings: list[Recording], rollouts: int | slice | Sequence[int] | None, path) -> list[set[int]] | None:
+def _chosen(
+    recordings: list[Recording], rollouts: int | slice | Sequence[int] | None, path: object
+) -> list[set[int]] | None:
     """The numbers of the chosen rollouts within each file."""
     if rollouts is None:
         return None
@@ -175,7 +178,7 @@ def _keep(numbers: set[int] | None, time: tuple[float, float] | None) -> Callabl
     return keep
 
 
-def _selected(rollouts: TensorDict, keys: Sequence[_Key], recordings: list[Recording], path) -> TensorDict:
+def _selected(rollouts: TensorDict, keys: Sequence[_Key], recordings: list[Recording], path: object) -> TensorDict:
     have = set(rollouts.keys(True))
     missing = [key for key in keys if (_path(key)[0] if len(_path(key)) == 1 else _path(key)) not in have]
     if missing:

@@ -66,9 +66,17 @@ class Recorder(Transform):
         OSError: as there, from the first step on.
 
     Examples:
-        >>> env = TransformedEnv(TabletopEnv("starter/open_the_top_drawer", 16), Recorder("runs/demo.mcap"))
-        >>> env.rollout(64)
-        >>> env.close()
+        >>> import tempfile
+        >>> from torchrl.envs import TransformedEnv
+        >>> from worldenv_trl.envs import TabletopEnv
+        >>> from worldenv_trl.record import list_rollouts
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     base = TabletopEnv("starter/open_the_top_drawer", 2, seed=0)
+        ...     env = TransformedEnv(base, Recorder(f"{folder}/demo.mcap"))
+        ...     rollout = env.rollout(5)
+        ...     env.close()
+        ...     [info.length for info in list_rollouts(f"{folder}/demo.mcap")]
+        [5, 5]
     """
 
     def __init__(
@@ -99,7 +107,7 @@ class Recorder(Transform):
                 raise TypeError(f"{name} must be a worldenv_trl.kinematics.{kind}, got {part!r}")
         self._target = Path(path)
         self._options = {"metadata": metadata, "attachments": attachments, "overwrite": overwrite}
-        self._derived = {"kinematics": kinematics, "action_map": action_map}
+        self._derived: dict[str, Any] = {"kinematics": kinematics, "action_map": action_map}
         paths = [(key,) if isinstance(key, str) else key for key in exclude]
         self._exclude = [path[1:] if path[0] == "next" and len(path) > 1 else path for path in paths]
         self._worker, self._queue_size = worker, queue_size
@@ -153,6 +161,7 @@ class Recorder(Transform):
         rows = active.nonzero().squeeze(-1)
         if not len(rows):
             return next_tensordict
+        assert self._stream is not None and self._paths is not None and self._fresh is not None  # it is open
         roots, nexts, chained, texts = self._paths
         batch = len(self.parent.batch_size)
         everyone = len(rows) == len(active)

@@ -249,9 +249,9 @@ class Recording:
                 rows += [row] * len(said)
                 messages += [data for _, data in said]
             _, step, *raw = message.unpack(messages)
-            row = torch.tensor(rows, dtype=torch.int64)
+            of = torch.tensor(rows, dtype=torch.int64)
             at = from_bytes(step, _INDEX).flatten() if messages else torch.zeros(0, dtype=torch.int64)
-            inside = at < torch.tensor(part.lengths)[row] if messages else at.bool()
+            inside = at < torch.tensor(part.lengths)[of] if messages else at.bool()
             for entry, data in zip(layout.numbers, raw, strict=True):
                 if not wanted(entry.key):
                     continue
@@ -260,7 +260,7 @@ class Recording:
                 if out is None or out.shape[2:] != entry.shape or out.dtype != entry.torch_dtype:
                     out = _unknown(part, entry.shape, entry.torch_dtype)
                 if messages:
-                    out[row[inside], at[inside]] = from_bytes(data, entry)[inside]
+                    out[of[inside], at[inside]] = from_bytes(data, entry)[inside]
                 part.values[key] = out
 
     def infos(self, parts: Iterable[Part]) -> list[RolloutInfo]:

@@ -59,7 +59,7 @@ class McapWriter:
         self._metadata: list[MetadataIndex] = []
         self._chunks: list[ChunkIndex] = []
         self._counts: dict[int, int] = {}
-        self._buffer = np.empty(2**20, np.uint8)
+        self._buffer, self._offset = np.empty(2**20, np.uint8), 0
         self._begin_chunk()
 
     def start(self, library: str) -> None:
@@ -147,7 +147,7 @@ class McapWriter:
         """Begins a new chunk: damage to a file costs the chunk that it hits."""
         if not self._index:
             return
-        data = self._buffer[: self._offset]
+        data = memoryview(self._buffer[: self._offset])  # type: ignore[arg-type] # NumPy's types tell it from 3.12 on
         packed = self._compressor.compress(data)
         entries = {channel: np.concatenate(parts) for channel, parts in self._index.items()}
         chunk = Chunk(

@@ -200,8 +200,10 @@ class McapScan:
     def _note(self, opcode: int, position: int, end: int) -> None:
         body = position + HEAD.size
         if opcode == Opcode.CHUNK:
-            start, last, size, crc, compression, data = self._chunk_parts(body)
-            self.chunks.append(Chunk(start, last, position, compression, size, crc, data, complete=True))
+            parts = self._chunk_parts(body)
+            if parts is not None:
+                start, last, size, crc, compression, data = parts
+                self.chunks.append(Chunk(start, last, position, compression, size, crc, data, complete=True))
         elif opcode == Opcode.METADATA:
             self.metadata.append(parsed(Metadata, self._bytes[body:end]))
         elif opcode == Opcode.ATTACHMENT:
@@ -240,8 +242,7 @@ class McapScan:
             return
         parts = self._chunk_parts(position + HEAD.size)
         if parts is not None and parts[-1].stop > len(self._bytes):
-            *known, data = parts
-            start, end, size, crc, compression = known
+            start, end, size, crc, compression, data = parts
             rest = slice(data.start, len(self._bytes))
             self.chunks.append(Chunk(start, end, position, compression, size, crc, rest, complete=False))
 

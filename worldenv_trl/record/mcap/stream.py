@@ -7,7 +7,7 @@ import json
 import queue
 import threading
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -91,7 +91,8 @@ class RolloutStream:
         self._file = open_file(path, options["metadata"], options["attachments"], options["overwrite"])
         self._texts, self._slot_steps, self._limits, self._proprio = list(texts), slot_steps, limits, proprio
         self._kinematics, self._action_map, self._hand = kinematics, action_map, kinematics
-        self._rows, self._before = rows, None  # kinematic states [rows, 20] before the step
+        self._rows = rows
+        self._before: Tensor | None = None  # kinematic states [rows, 20] before the step
         self._encoder: RolloutEncoder | None = None
         self._starts: list[int] = []
         self._lengths: list[int] = []
@@ -140,11 +141,11 @@ class RolloutStream:
         self._finalizer.detach()
         self._raise()
 
-    def _hand_over(self, job) -> None:
+    def _hand_over(self, job: Callable[[], None]) -> None:
         self._raise()
         self._queue.put(job)
 
-    def _wait_for(self, job) -> None:
+    def _wait_for(self, job: Callable[[], None]) -> None:
         done = threading.Event()
         failed: list[ValueError] = []
 
@@ -244,6 +245,9 @@ class RolloutStream:
     def _write_block(self) -> None:
         """Writes what has gathered rollout by rollout, in a few chunks."""
         block, self._block, self._block_bytes = self._block, [], 0
+        encoder = self._encoder
+        if encoder is None:  # nothing was put yet
+            return
         if block:
             numbers = np.concatenate([part.numbers for part in block])
             steps = np.concatenate([part.steps for part in block])
@@ -257,16 +261,17 @@ class RolloutStream:
             for chosen in _shares(numbers, _BLOCK_CHUNKS):
                 fresh = np.isin(first, numbers[chosen]).nonzero()[0]
                 if len(fresh):
-                    self._encoder.reset(first[fresh], starts[first[fresh]], {k: v[fresh] for k, v in begun.items()})
+                    encoder.reset(first[fresh], starts[first[fresh]], {k: v[fresh] for k, v in begun.items()})
                 of = numbers[chosen]
-                self._encoder.steps(of, steps[chosen], starts[of], {key: v[chosen] for key, v in values.items()})
+                encoder.steps(of, steps[chosen], starts[of], {key: v[chosen] for key, v in values.items()})
                 self._file.end_chunk()
         lines, self._lines = self._lines, []
         for line in lines:
-            self._encoder.say(*line)
+            encoder.say(*line)
 
     @property
     def _layout(self) -> Layout:
+        assert self._encoder is not None  # asked for once something was put
         return self._encoder.layout
 
     def _begin_texts(self, said: list[tuple[str, ...]] | None) -> None:
@@ -296,9 +301,9 @@ class RolloutStream:
                 self._hand = ForwardKinematics()
             pose = self._hand.pose(after)
             values["next", ACTION_MAP] = painted(self._action_map(pose, tool_pose=pose))
-        ended = [values.get(("next", name)) for name in ("terminated", "truncated")]
-        if None not in ended:
-            values["next", TERMINATION] = self._causes(values, *ended)
+        terminated, truncated = (values.get(("next", name)) for name in ("terminated", "truncated"))
+        if terminated is not None and truncated is not None:
+            values["next", TERMINATION] = self._causes(values, terminated, truncated)
 
     def _causes(self, values: dict[_Path, Tensor], terminated: Tensor, truncated: Tensor) -> Tensor:
         """int64 [n, 1]."""
@@ -323,9 +328,9 @@ class RolloutStream:
             if value is None or value.shape[1:] != shape or value.dtype != dtype:
                 found = "is missing" if value is None else f"is {value.dtype} {list(value.shape[1:])}"
                 raise ValueError(f"entry {key} {found}, it was {entry.dtype} {list(entry.shape)} when recording began")
-            if entry.stored == "last_of_frames":
+            frames = same_camera(entry.key)
+            if entry.stored == "last_of_frames" and frames is not None:
                 last = (values["next", STEP_MASK].sum(-1) - 1).clamp(min=0)
-                frames = same_camera(entry.key)
                 shown = values["next", *frames][torch.arange(len(last)), last]
                 if not torch.equal(shown, values[key]):
                     raise ValueError(f"entry {key} is not the last executed one of {frames}, as it was at first")

@@ -84,8 +84,16 @@ class RolloutWriter:
         OSError: if the disk is full, from any method; the partial file keeps what is complete.
 
     Examples:
-        >>> with RolloutWriter("runs/demo.mcap", metadata={"task": "starter/open_the_top_drawer"}) as writer:
-        ...     writer.write(env.rollout(64))
+        >>> import tempfile
+        >>> from worldenv_trl.envs import TabletopEnv
+        >>> from worldenv_trl.record import read_rollouts
+        >>> env = TabletopEnv("starter/open_the_top_drawer", 2, seed=0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with RolloutWriter(f"{folder}/demo.mcap", metadata={"task": "starter/open_the_top_drawer"}) as writer:
+        ...         numbers = writer.write(env.rollout(5))
+        ...     rollouts = read_rollouts(folder, task="starter/open_the_top_drawer", keys=["action", "observation"])
+        >>> numbers, rollouts["observation", "image"].shape
+        ([0, 1], torch.Size([2, 5, 3, 64, 64]))
     """
 
     def __init__(
@@ -255,7 +263,7 @@ def _contents(name: str, value: bytes | str | os.PathLike) -> bytes:
     return str(value).encode()
 
 
-def _row_texts(path: tuple[str, ...], value: Any, shape: tuple[int, int], lengths: Tensor) -> list[str]:
+def _row_texts(path: tuple[str, ...], value: Any, shape: Sequence[int], lengths: Tensor) -> list[str]:
     """One text for each rollout, from nested lists [*B, T]."""
     rows, steps = shape
     words = [value] * (rows * steps) if isinstance(value, str) else _flatten(value)

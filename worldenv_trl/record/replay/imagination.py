@@ -77,7 +77,7 @@ def replay_imagination(
         proprio=proprio,
         seed=seed,
     )
-    reflect = None if reflector is None else Reflect(reflector, rule)
+    reflect = None if reflector is None or rule is None else Reflect(reflector, rule)
     env = env if reflect is None else TransformedEnv(env, reflect)
     if branch is not None:
         branch.check_policy(env)
@@ -90,7 +90,7 @@ def replay_imagination(
         behind = turn is not None and decision >= turn
         if branch is not None:  # it is at a whole decision
             branch.direct(reflect, rule, branch.step if behind else -1)
-        if behind and branch.policy is not None:
+        if branch is not None and behind and branch.policy is not None:
             chunk, rows = branch.decide(td), torch.ones(count, dtype=torch.bool)
             if chunk.shape[-2] != length:
                 raise ValueError(f"the policy's chunks have {chunk.shape[-2]} actions, the world model's {length}")
@@ -110,7 +110,7 @@ def replay_imagination(
         entries.append(out)
         masks.append(rows)
         td = step_mdp(out, exclude_action=True)
-    played = torch.stack(entries, -1).reshape(count, len(entries))
+    played: TensorDict = torch.stack(entries, -1).reshape(count, len(entries))
     played[MASK] = torch.stack(masks, -1)
     return played
 

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs import EnvBase
 from torchrl.envs.transforms import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
@@ -14,7 +16,7 @@ from worldenv_trl.record.replay.branch import Branch
 from worldenv_trl.record.replay.source import Source, recorded_task
 
 if TYPE_CHECKING:
-    from worldenv_trl.envs import TabletopEnv
+    from worldenv_trl.envs import Reflect, TabletopEnv
     from worldenv_trl.reflectors import Reflector, StopRule
 
 __all__ = ["replay_physics", "state_parts"]
@@ -35,7 +37,7 @@ def replay_physics(
     """
     env = base = _env_of(source, notes)
     reflect = None
-    if reflector is not None:
+    if reflector is not None and rule is not None:
         from worldenv_trl.envs import Reflect
 
         reflect = Reflect(reflector, rule)
@@ -52,7 +54,9 @@ def replay_physics(
         env.close(raise_if_closed=False)
 
 
-def _play(source: Source, env, td: TensorDict, first: int, branch: Branch | None, reflect) -> TensorDict:
+def _play(
+    source: Source, env: EnvBase, td: TensorDict, first: int, branch: Branch | None, reflect: Reflect | None
+) -> TensorDict:
     actions, until = source.actions, source.steps
     turn = until + 1 if branch is None else branch.step
     rule = None if reflect is None else reflect.rule
@@ -60,11 +64,12 @@ def _play(source: Source, env, td: TensorDict, first: int, branch: Branch | None
         until = max(until, int(_innermost(env)._limit.max()))
     if branch is not None and branch.seed is not None:
         torch.manual_seed(branch.seed)
-    entries, planned = [], []
+    entries = []
+    planned: list[Tensor] = []
     for step in range(first, until):
         if branch is not None:
             branch.direct(reflect, rule, step)
-        if step >= turn and branch.policy is not None:
+        if branch is not None and step >= turn and branch.policy is not None:
             planned = planned or list(branch.decide(td)[0])
             action = planned.pop(0).clamp(-1, 1)
         elif step < len(actions):
@@ -77,7 +82,7 @@ def _play(source: Source, env, td: TensorDict, first: int, branch: Branch | None
         if step >= turn and bool(out["next", "done"].any()):
             break
         td = step_mdp(out, exclude_action=True)
-    played = torch.stack(entries, -1)[0]
+    played: TensorDict = torch.stack(entries, -1)[0]
     played[MASK] = torch.ones(len(played), dtype=torch.bool)
     return played
 
@@ -153,7 +158,7 @@ def state_parts(source: Source) -> tuple[tuple[str, int], ...]:
     return tuple((name.removeprefix("mjSTATE_").lower(), size) for name, size in sizes if size)
 
 
-def _innermost(env):
+def _innermost(env: EnvBase) -> EnvBase:
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env

@@ -6,11 +6,12 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from worldenv_trl.keys import FRAMES, MASK, SUCCESS, SUCCESS_PROB
 from worldenv_trl.record.mcap.provenance import model_hash, package_versions
@@ -84,8 +85,18 @@ def replay(
         FileExistsError: if the new file exists.
 
     Examples:
-        >>> print(replay("runs/demo/rollouts/demonstrations.mcap", 3))
-        >>> print(replay("runs/demo/rollouts/demonstrations.mcap", 3, edits={20: {6: -1.0}}))  # open the hand
+        >>> import tempfile
+        >>> from worldenv_trl.envs import TabletopEnv
+        >>> from worldenv_trl.record import provenance, recorded
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     base = TabletopEnv("starter/open_the_top_drawer", 2, seed=0)
+        ...     env = recorded(base, f"{folder}/demo.mcap", **provenance(base))
+        ...     rollout = env.rollout(8)
+        ...     env.close()
+        ...     again = replay(f"{folder}/demo.mcap", 1)
+        ...     changed = replay(f"{folder}/demo.mcap", 1, edits={3: {2: 1.0}})  # upwards
+        >>> again.exact, changed.kind, changed.divergences[0].step
+        (True, 'what-if', 4)
     """
     source = open_rollout(path, rollout)
     mode = mode or ("imagination" if source.imagined else "physics")
@@ -107,7 +118,7 @@ def replay(
             played, unchanged = _imagined(source, branch, from_step, notes, **options)
             first = 0
     same = _same_versions(source, notes) and source.imagined == (mode == "imagination")
-    if mode == "imagination" and source.imagined:
+    if mode == "imagination" and source.imagined and world_model is not None:
         same = _same_model(source, "world_model", world_model, notes) and same
     if reflector is not None:
         same = _same_model(source, "reflector", reflector, notes) and same
@@ -149,7 +160,17 @@ def replay(
     return report
 
 
-def _branch(source, mode, world_model, reflector, from_step, policy, seed, threshold, edits) -> Branch | None:
+def _branch(
+    source: Source,
+    mode: str,
+    world_model: WorldModel | None,
+    reflector: Reflector | None,
+    from_step: int,
+    policy: TensorDictModuleBase | None,
+    seed: int | None,
+    threshold: float | None,
+    edits: Mapping[int, Mapping[int, float]],
+) -> Branch | None:
     """Checks what was asked for; None if nothing is changed."""
     if mode not in MODES:
         raise ValueError(f"mode must be one of {', '.join(MODES)}, got {mode!r}")
@@ -174,7 +195,7 @@ def _branch(source, mode, world_model, reflector, from_step, policy, seed, thres
 
 
 def _imagined(
-    source: Source, branch: Branch | None, from_step: int, notes: list[str], **options
+    source: Source, branch: Branch | None, from_step: int, notes: list[str], **options: Any
 ) -> tuple[TensorDict, TensorDict | None]:
     """The rollout in imagination; for a what-if also what happens there when nothing is changed."""
     from worldenv_trl.record.replay.imagination import chunks_of, replay_imagination  # reading needs no world models
@@ -219,10 +240,10 @@ def _wave(source: Source) -> tuple[TensorDict, int, int] | None:
         return None
     rows, numbers = batch[0] * batch[1], [] if part is None else part.numbers
     if part is None:  # a recorder's: the rows that began as often
-        infos = [info for info in list_rollouts(source.path) if info.row is not None]
-        episode = next((info.episode for info in infos if info.number == source.number), None)
-        here = sorted((info for info in infos if info.episode == episode), key=lambda info: info.row)
-        numbers = [info.number for info in here]
+        infos = [(info.row, info) for info in list_rollouts(source.path) if info.row is not None]
+        episode = next((info.episode for _, info in infos if info.number == source.number), None)
+        here = sorted((row, info.number) for row, info in infos if info.episode == episode)
+        numbers = [number for _, number in here]
     if source.number not in numbers or len(numbers) % rows:
         return None
     place = numbers.index(source.number)
@@ -291,7 +312,15 @@ def _target(source: Source, mode: str, branch: Branch | None, target: str | os.P
     return source.path.with_name(f"{source.path.stem}_rollout{source.number}_{kind}.mcap")
 
 
-def _write(source, played: TensorDict, report: ReplayReport, recorded, target: Path, overwrite, models) -> None:
+def _write(
+    source: Source,
+    played: TensorDict,
+    report: ReplayReport,
+    recorded: Mapping[str, tuple[Tensor, Tensor]],
+    target: Path,
+    overwrite: bool,
+    models: Mapping[str, torch.nn.Module | None],
+) -> None:
     """The replay as a recording, each step with its recorded image and the difference between both."""
     played = played.copy()
     have = played.keys(True, True)

@@ -21,7 +21,7 @@ __all__ = ["APPLICATION", "require_rerun", "rerun_blueprint", "rerun_recording"]
 
 APPLICATION = "worldenv_trl"
 # Plots from top to bottom: title, and the entries that belong to it.
-PLOTS = (
+PLOTS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("outcome", ("reward", "success", "success_prob")),
     ("difference from the recording (PSNR, dB)", ("recorded/psnr",)),
     ("action", ("action", "vla_action/chunk")),
@@ -71,8 +71,8 @@ def rerun_blueprint(shown: Sequence[Shown]) -> Any:
     curves = {curve.name for rollout in shown for curve in rollout.curves}
     cameras = [rrb.Spatial2DView(origin=f"/camera/{name}", name=_title(name)) for name in images]
     plots = []
-    for title, names in PLOTS:
-        names = [name for name in names if name in curves]
+    for title, wanted in PLOTS:
+        names = [name for name in wanted if name in curves]
         if "states/position" in names:  # every step of a decision, not the last one alone
             names.remove("observation/state/position")
         contents = [f"/scalars/{name}" for name in names]

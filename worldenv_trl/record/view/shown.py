@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -90,7 +91,7 @@ def shown_rollouts(path: str | os.PathLike, rollouts: Sequence[int] | slice = sl
             yield _shown(entries, number, parts[0].starts[0] / 1e9, recording.metadata)
 
 
-def _file(path: str | os.PathLike):
+def _file(path: str | os.PathLike) -> Path:
     from worldenv_trl.record.mcap.reader import _require_file
 
     return _require_file(path)
@@ -140,7 +141,7 @@ def _curves(entries: TensorDict) -> list[Curve]:
     length = entries["next", STEP_MASK].shape[1] if ("next", STEP_MASK) in have else 0
     curves = []
     for key in sorted(have, key=str):
-        path = (key,) if isinstance(key, str) else key
+        path: tuple[str, ...] = (key,) if isinstance(key, str) else key
         below = path[1:] if path[0] == "next" else path
         if (path[0] != "next" and ("next", *path) in have) or below == MASK or below[-1] in _NUMBERS:
             continue

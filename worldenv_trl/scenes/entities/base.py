@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from dm_control import composer, mjcf
 
 Color = tuple[float, float, float, float]
 
 SOLID = {"condim": 4, "friction": (1.0, 0.01, 0.0005), "solref": (0.01, 1), "solimp": (0.95, 0.99, 0.001)}
-GHOST = {"contype": 0, "conaffinity": 0, "mass": 0.0}
+GHOST: dict[str, Any] = {"contype": 0, "conaffinity": 0, "mass": 0.0}
 """Drawn only."""
-INVISIBLE = {"rgba": (0, 0, 0, 0), "group": 4}
+INVISIBLE: dict[str, Any] = {"rgba": (0, 0, 0, 0), "group": 4}
 
 
 @dataclass(frozen=True)
@@ -95,11 +96,20 @@ class Primitive(composer.Entity):
 
     # ------------------------------------------------------------------------------------------------- parts
 
-    def _box(self, body: mjcf.Element, center: Sequence[float], half_size: Sequence[float], **options) -> mjcf.Element:
+    def _box(
+        self, body: mjcf.Element, center: Sequence[float], half_size: Sequence[float], **options: Any
+    ) -> mjcf.Element:
         return body.add("geom", type="box", pos=tuple(center), size=tuple(half_size), **options)
 
     def _disc(
-        self, body: mjcf.Element, radius: float, low: float, high: float, *, at: Sequence[float] = (0.0, 0.0), **options
+        self,
+        body: mjcf.Element,
+        radius: float,
+        low: float,
+        high: float,
+        *,
+        at: Sequence[float] = (0.0, 0.0),
+        **options: Any,
     ) -> mjcf.Element:
         """An upright cylinder between two heights."""
         center = (*at, (low + high) / 2)
@@ -116,7 +126,7 @@ class Primitive(composer.Entity):
         mass: float,
         staves: int = 12,
         thickness: float = 0.003,
-        **options,
+        **options: Any,
     ) -> None:
         """A wall around the z axis, hollow inside: flat staves of ``mass`` each, ``foot`` from the axis at ``low``, and
         ``rim`` at ``high``."""
@@ -134,18 +144,20 @@ class Primitive(composer.Entity):
         self,
         body: mjcf.Element,
         name: str,
-        center: Sequence[float],
-        half_size: Sequence[float],
+        center: tuple[float, float, float],
+        half_size: tuple[float, float, float],
         *,
         on_top: bool = False,
     ) -> None:
         body.add("site", name=name, type="box", pos=tuple(center), size=tuple(half_size), **INVISIBLE)
         owner = "" if body is self._root.worldbody else body.name
-        self.regions[name] = Region(name, tuple(center), tuple(half_size), owner, on_top)
+        self.regions[name] = Region(name, center, half_size, owner, on_top)
 
-    def _jut(self, body: mjcf.Element, name: str, center: Sequence[float], half_size: Sequence[float]) -> None:
+    def _jut(
+        self, body: mjcf.Element, name: str, center: Sequence[float], half_size: tuple[float, float, float]
+    ) -> None:
         body.add("site", name=name, type="box", pos=tuple(center), size=tuple(half_size), **INVISIBLE)
-        self.juts[name] = tuple(half_size)
+        self.juts[name] = half_size
 
     def _mark(self, body: mjcf.Element, name: str, position: Sequence[float]) -> None:
         """A point that others look for: a handle, a centre."""

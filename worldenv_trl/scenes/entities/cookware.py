@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import mujoco
 from dm_control import mjcf
@@ -20,7 +21,8 @@ class FryingPan(Primitive):
     grasp = Grasp((0.125, 0.0, 0.030))
 
     def _shape(self, body: mjcf.Element) -> None:
-        iron, inside = {"rgba": (0.16, 0.16, 0.18, 1)}, {"rgba": (0.46, 0.47, 0.50, 1), **WORN.of(self._root)}
+        iron: dict[str, Any] = {"rgba": (0.16, 0.16, 0.18, 1)}
+        inside: dict[str, Any] = {"rgba": (0.46, 0.47, 0.50, 1), **WORN.of(self._root)}
         self._disc(body, 0.078, 0.0, 0.006, mass=0.20, **iron)
         self._disc(body, 0.070, 0.0005, 0.0066, **GHOST, **inside)
         self._ring(body, 0.076, 0.083, 0.0, 0.035, mass=0.008, **iron)
@@ -72,7 +74,7 @@ class Stove(Primitive):
             "joint", name="lever", type="hinge", axis=(0, 0, 1), range=(0, 1.7), limited=True, damping=0.05,
             frictionloss=0.03, armature=0.002,
         )  # fmt: skip
-        blue = {"contype": 0, "conaffinity": 0, "rgba": (0.08, 0.2, 0.75, 1)}
+        blue: dict[str, Any] = {"contype": 0, "conaffinity": 0, "rgba": (0.08, 0.2, 0.75, 1)}
         self._disc(lever, 0.022, -0.010, 0.002, mass=0.05, **blue)
         self._box(lever, (self.PEG_RADIUS / 2, 0, 0), (self.PEG_RADIUS / 2, 0.010, 0.005), mass=0.05, **blue)
         lever.add(

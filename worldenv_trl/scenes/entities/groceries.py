@@ -39,7 +39,7 @@ class Packet(Primitive):
         stripe: Color = (0.1, 0.3, 0.8, 1),
         mass: float = 0.12,
     ) -> None:
-        length, depth, height = half = tuple(value / 2 for value in size)
+        length, depth, height = half = (size[0] / 2, size[1] / 2, size[2] / 2)
         self.radius, self.height, self.footprint = (length**2 + depth**2) ** 0.5, size[2], half[:2]
         if size[1] < 0.075:  # else it is wider than the hand opens
             self.grasp = Grasp((0.0, 0.0, 0.6 * size[2]), release=0.035)

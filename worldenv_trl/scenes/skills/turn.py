@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from worldenv_trl.scenes.skills.phase import CLOSE, FINGER_HALF, OPEN, Phase, ax
 if TYPE_CHECKING:
     from worldenv_trl.scenes.files import FileTask
     from worldenv_trl.scenes.simulation import SceneBatch
+
+_Fixture = TypeVar("_Fixture", bound=Primitive)
 
 _OVER = 0.07  # above where the fingers go down
 _BEYOND = 0.012  # how far a drawer is pulled past where it counts as open, m
@@ -139,7 +141,7 @@ def _stroke(
     return [replace(phase, again=again) for phase in phases]
 
 
-def _fixture(task: FileTask, thing: str, kind: type[Primitive], what: str):
+def _fixture(task: FileTask, thing: str, kind: type[_Fixture], what: str) -> _Fixture:
     entity = task.entities[thing]
     if not isinstance(entity, kind):
         raise ValueError(f"no script for {task.name}: {thing} cannot be {what}")
