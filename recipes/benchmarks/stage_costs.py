@@ -1,8 +1,8 @@
 """Seconds and peak memory of every stage, each in a process of its own (Linux).
 
-``python recipes/benchmarks/stage_costs.py improve --run-dir runs/measured --num-threads 1``: a preset and settings as for
-``recipes/world_env.py``; the folder must be new. Memory is that of the process and its helpers together: ``resident``
-is all of it, ``own`` leaves out what merely shows files and can be dropped at any time.
+``python recipes/benchmarks/stage_costs.py improve --run-dir runs/measured --num-threads 1``: a preset and settings as
+for ``recipes/world_env.py``; the folder must be new. Memory is that of the process and its helpers together:
+``resident`` is all of it, ``own`` leaves out what merely shows files and can be dropped at any time.
 """
 
 from __future__ import annotations
