@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from config import WorldEnvConfig
@@ -17,13 +18,17 @@ from run_folder import RunFolder
 from two_worlds import TwoWorlds, honesty_of, imagine, live, relive
 from worldenv_trl import keys
 from worldenv_trl.data import Episodes, episodes_from_rollouts
+from worldenv_trl.data.episodes import concatenated
 from worldenv_trl.metrics import advantage_correlation, first_success, honesty, judged, moving_pixel_psnr
 from worldenv_trl.policies import laplace_actor
 from worldenv_trl.record import read_rollouts
+from worldenv_trl.record.mcap.recording import Recording
 from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.report import Clip, Evidence, RunRecord, choose_clips, count_kinds
 from worldenv_trl.scenes import load_task
 from worldenv_trl.world_models import WorldModel
+
+_AT_ONCE = 16  # rollouts in memory while a wave is read
 
 
 def gather(
@@ -168,7 +173,7 @@ def _honesty_rows(worlds: TwoWorlds, policy: str, config: WorldEnvConfig) -> lis
     return rows
 
 
-def _by_task(episodes: Episodes, config: WorldEnvConfig) -> list[tuple[str, torch.Tensor]]:
+def _by_task(episodes: Episodes | TensorDictBase, config: WorldEnvConfig) -> list[tuple[str, torch.Tensor]]:
     number = episodes[keys.TASK_ID].squeeze(-1)
     rows = {task: number == place for place, task in enumerate(config.tasks)}
     return [("all", torch.ones_like(number, dtype=torch.bool)), *((t, r) for t, r in rows.items() if bool(r.any()))]
@@ -184,20 +189,24 @@ def _relived(run: Run, path: Path) -> list[dict[str, Any]]:
     config = run.config
     if config.post_train.env != "imagined":
         return []
-    rollouts = read_rollouts(path)
-    print(f"{path.name}: {rollouts.shape[:-1].numel()} imagined rollouts in the physics")
-    episodes = episodes_from_rollouts(rollouts)
-    stopped = (rollouts["next", "terminated"].squeeze(-1) & rollouts[keys.MASK]).any(-1).flatten()
-    stop = torch.where(stopped, episodes["length"].squeeze(-1), -1)
+    count = Recording(path).count()
+    print(f"{path.name}: {count} imagined rollouts in the physics")
+    entries, stops, returns = [], [], []
+    for start in range(0, count, _AT_ONCE):  # their frames are not kept
+        rollouts = read_rollouts(path, rollouts=slice(start, start + _AT_ONCE))
+        entries.append(episodes_from_rollouts(rollouts).entries)
+        stopped = (rollouts["next", "terminated"].squeeze(-1) & rollouts[keys.MASK]).any(-1)
+        stops.append(torch.where(stopped, entries[-1]["length"].squeeze(-1), -1))
+        returns.append(rollouts["returns"][:, 0])  # the same at every decision
+    episodes, stop, returned = concatenated(entries), torch.cat(stops), torch.cat(returns)
     reached = first_success(relive(run, episodes))
     imagined, real = judged(stop, reached)
-    returns = rollouts["returns"][..., 0].flatten()  # [G, N, T] holds the same at every decision
     rows = []
     for task, chosen in _by_task(episodes, config):
         figures = honesty(imagined[chosen], real[chosen], imagined_steps=stop[chosen], real_steps=reached[chosen])
         groups = (-1, config.post_train.group_size)  # a group's rollouts follow each other and are of one task
         figures["signal"], figures["mixed"] = advantage_correlation(
-            returns[chosen].reshape(groups), real[chosen].reshape(groups)
+            returned[chosen].reshape(groups), real[chosen].reshape(groups)
         )
         rows.append({"iteration": int(path.stem.rsplit("_", 1)[1]), "task": task} | figures)
     return rows

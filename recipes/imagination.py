@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from tensordict import TensorDict
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, TransformedEnv
 
+from episodes import demonstrations_and_exploration
 from parts import PROPRIO
 from run import Run
 from worldenv_trl import keys
 from worldenv_trl.envs import FramesAside, ImaginedEnv, Reflect
-from worldenv_trl.record import read_rollouts
 from worldenv_trl.reflectors import Reflector, StopRule
+from worldenv_trl.row_texts import row_texts
 from worldenv_trl.world_models import WorldModel
 
 
@@ -31,7 +33,7 @@ class Imagination:
     def load(cls, run: Run, suffix: str) -> Imagination:
         """That of a round."""
         world_model = run.world_model(suffix)
-        contexts = read_contexts(run, world_model.cameras)
+        contexts = read_contexts(run, world_model.cameras, rounds=int(suffix.removeprefix("_") or 1))
         return cls(world_model, run.reflector(suffix), run.rules(suffix)["imagined"], contexts)
 
     def env(self, run: Run, batch_size: Sequence[int], contexts: TensorDict | None = None) -> TransformedEnv:
@@ -54,11 +56,21 @@ def frames_aside(env: EnvBase) -> FramesAside | None:
     return next((each for each in getattr(transform, "transforms", ()) if isinstance(each, FramesAside)), None)
 
 
-def read_contexts(run: Run, cameras: Sequence[str]) -> TensorDict:
-    """The distinct training contexts (g, o_1, s_1) among the logged exploration rollouts; no simulator is touched."""
-    wanted = [*(keys.image_key(camera) for camera in cameras), keys.STATE, keys.KINEMATIC_STATE]
-    wanted += [keys.INSTRUCTION, keys.TASK_ID, keys.CONTEXT_ID]
-    first = read_rollouts(run.folder.require_rollouts("explore", "explore"), steps=slice(0, 1), keys=wanted)[:, 0]
-    ids = first[keys.CONTEXT_ID].squeeze(-1)
-    rows = [int((ids == value).nonzero()[0, 0]) for value in ids.unique()]
-    return first[rows]
+def read_contexts(run: Run, cameras: Sequence[str], rounds: int = 1) -> TensorDict:
+    """The distinct training contexts (g, o_1, s_1) of the exploration of some rounds; no simulator is touched."""
+    _, explored = demonstrations_and_exploration(run, rounds)
+    ids = explored[keys.CONTEXT_ID].squeeze(-1)
+    rows = torch.tensor([int((ids == value).nonzero()[0, 0]) for value in ids.unique()])
+    first = torch.zeros_like(rows)
+    contexts = TensorDict(
+        {
+            keys.STATE: explored["states"][rows, 0],
+            keys.KINEMATIC_STATE: explored["kinematic_states"][rows, 0],
+            keys.TASK_ID: explored[keys.TASK_ID][rows],
+            keys.CONTEXT_ID: explored[keys.CONTEXT_ID][rows],
+        },
+        batch_size=[len(rows)],
+    )
+    for camera in cameras:
+        contexts[keys.image_key(camera)] = explored.frames(camera, rows, first)
+    return contexts.set(keys.INSTRUCTION, row_texts([explored.instructions[row] for row in rows.tolist()]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType
 
@@ -78,8 +79,8 @@ def imagine(
     return TwoWorlds(episodes, imagined, scores["real"], scores["imagined"], stops["real"], stops["imagined"])
 
 
-def relive(run: Run, imagined: Episodes, split: str = "train") -> Tensor:
-    """Success bool ``[R, T + 1]`` in the physics of the actions of ``imagined`` episodes ``[R]``, frame by frame.
+def relive(run: Run, imagined: Episodes | TensorDictBase, split: str = "train") -> Tensor:
+    """Success bool ``[R, T + 1]`` in the physics of the actions of ``imagined`` episodes (or their entries alone).
 
     Each row starts from the initial state that its ``context_id`` names; nothing is rendered. Past an episode's end the
     last value is repeated.
