@@ -56,7 +56,11 @@ def frames_aside(env: EnvBase) -> FramesAside | None:
 
 def read_contexts(run: Run, cameras: Sequence[str]) -> TensorDict:
     """The distinct training contexts (g, o_1, s_1) among the logged exploration rollouts; no simulator is touched."""
-    wanted = [*(keys.image_key(camera) for camera in cameras), keys.STATE, keys.KINEMATIC_STATE]
+    wanted: list[str | tuple[str, ...]] = [
+        *(keys.image_key(camera) for camera in cameras),
+        keys.STATE,
+        keys.KINEMATIC_STATE,
+    ]
     wanted += [keys.INSTRUCTION, keys.TASK_ID, keys.CONTEXT_ID]
     first = read_rollouts(run.folder.require_rollouts("explore", "explore"), steps=slice(0, 1), keys=wanted)[:, 0]
     ids = first[keys.CONTEXT_ID].squeeze(-1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType
 
@@ -45,7 +46,7 @@ class TwoWorlds:
         return judged(self.imagined_stop, self.reached, late)
 
 
-def live(run: Run, actor, per_task: int, split: str = "test") -> Episodes:
+def live(run: Run, actor: TensorDictModuleBase, per_task: int, split: str = "test") -> Episodes:
     """Greedy episodes of every task in the physics, each to the step limit whether the goal is reached or not.
 
     Returns:
