@@ -65,8 +65,7 @@ def post_train(run: Run, source: str, target: str, models: str) -> None:
     probed, recorded = probed_iterations(settings), {0, settings.iterations - 1}
     alarm = HonestyAlarm(len(probed), false_alarm_rate=settings.false_alarm_rate) if probed and imagination else None
     aside = frames_aside(env)
-    if aside is not None:  # frames are kept, on disk, of the waves that are recorded
-        aside.keep = True
+    _record_next(True, collector, aside)
     progress, started = tqdm(collector, total=settings.iterations, desc=target, unit="it"), time.monotonic()
     stuck_for = 0
     for iteration, wave in enumerate(progress):
@@ -101,10 +100,17 @@ def post_train(run: Run, source: str, target: str, models: str) -> None:
                 progress.write(warning(target, iteration, metrics))
         run.folder.log(target, step=iteration, **metrics)
         progress.set_postfix({k: f"{metrics[k]:.3f}" for k in ("return", "kl_approx", "real_success") if k in metrics})
-        if aside is not None:
-            aside.keep = iteration + 1 in recorded
+        del wave  # before the next one is collected
+        _record_next(iteration + 1 in recorded, collector, aside)
     collector.shutdown()
     averaged.save_pretrained(run.folder.checkpoint(target))
+
+
+def _record_next(yes: bool, collector: GroupCollector, aside: FramesAside | None) -> None:
+    """Waves carry what is learned from; those that are recorded carry all, and their frames go to disk."""
+    collector.exclude = () if yes else [("next", "observation")]
+    if aside is not None:
+        aside.keep = yes
 
 
 def _write(run: Run, name: str, about: dict, wave: TensorDictBase, aside: FramesAside | None) -> None:
@@ -112,9 +118,9 @@ def _write(run: Run, name: str, about: dict, wave: TensorDictBase, aside: Frames
     frames = None if aside is None else aside.frames()
     with RolloutWriter(run.folder.rollouts(name), **about, overwrite=True) as writer:
         for group in range(wave.shape[0]):
-            part = wave[group].clone(False)
+            part = wave[group : group + 1].clone(False)
             if frames is not None:
-                part["next"] = part["next"].clone(False).update(frames[group].to_tensordict())
+                part["next"] = part["next"].clone(False).update(frames[group : group + 1].contiguous())
             writer.write(part)
 
 

@@ -10,7 +10,9 @@ from tensordict import NestedKey, TensorDictBase
 
 from config import PostTrain
 from worldenv_trl import keys
+from worldenv_trl.language import instructions_of
 from worldenv_trl.objectives import LOOPLoss
+from worldenv_trl.row_texts import row_texts
 
 PATIENCE = 3  # iterations
 STUCK = (
@@ -51,6 +53,7 @@ def update(
     # Flat first: a mask that leaves a whole block of texts without one makes tensordict stumble over the empty stack.
     decisions = wave.select(*in_keys, *learned).reshape(-1)[informative.flatten()]
     decisions[keys.STEP_MASK] = decisions["next", keys.STEP_MASK]
+    decisions.set(keys.INSTRUCTION, row_texts(instructions_of(decisions)))  # cheap to index, minibatch by minibatch
     total_steps = (wave["next", keys.STEP_MASK] & mask.unsqueeze(-1)).sum()
     sums: dict[str, float] = {}
     count, stopped = 0, False

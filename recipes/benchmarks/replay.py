@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import tempfile
 import time
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -105,6 +104,5 @@ def main(settings: Benchmark) -> None:
 
 
 if __name__ == "__main__":
-    warnings.filterwarnings("ignore", message="Creating .*WeightUpdater")
     torch.set_num_threads(1)
     main(tyro.cli(Benchmark, description=__doc__))

@@ -114,17 +114,14 @@ def test_decisions_give_the_images_of_the_cameras_whose_frames_they_hold():
 
 
 def test_a_decision_knows_success_at_its_last_executed_step():
-    executed = [[3, 2, 0], [3, 3, 1]]
-    rollouts = decision_rollouts(executed, success=True)
-    episodes = episodes_from_rollouts(rollouts)
-    for row, counts in enumerate(executed):
-        known, place = False, 0
-        for decision, count in enumerate(counts):
-            for step in range(count):
-                place += 1
-                if step == count - 1:
-                    known = bool(rollouts["next", keys.SUCCESS][row, decision])
-                assert bool(episodes["success"][row, place]) == known
+    rollouts = decision_rollouts([[3, 2, 0], [1, 3, 2], [3, 3, 1]], success=True)
+    reached = torch.tensor([[False, True, True], [True, False, True], [False, False, False]]).unsqueeze(-1)
+    rollouts["next", keys.SUCCESS] = reached
+    rollouts[keys.SUCCESS] = torch.cat([torch.zeros_like(reached[:, :1]), reached[:, :-1]], 1)
+    success = episodes_from_rollouts(rollouts)["success"].int().tolist()
+    assert success[0] == [0, 0, 0, 0, 0, 1, 1, 1]  # repeated past the end
+    assert success[1] == [0, 1, 1, 1, 0, 0, 1, 1]
+    assert not any(success[2])
 
 
 def test_a_rollout_without_a_step_keeps_its_reset():

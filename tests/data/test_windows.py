@@ -6,7 +6,7 @@ from small_rollouts import CAMERAS, make_episodes
 from swaps.copying_world_model import CopyingConfig, CopyingWorldModel
 from torchrl.data import ReplayBuffer
 
-from worldenv_trl import keys
+from worldenv_trl import keys, memmap
 from worldenv_trl.data import Episodes, WindowBuffer, WindowSampler, predicted_poses, window_buffer
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.language import instructions_of
@@ -130,6 +130,17 @@ def test_a_window_answers_everything_that_the_model_asks():
 def test_a_window_holds_the_frames_of_the_models_cameras_alone():
     buffer = window_buffer(make_episodes([12, 9]), FK, world_model(["wrist"]), seed=0)
     assert set(buffer.sample()["frames"].keys()) == {"wrist_image"}
+
+
+def test_windows_of_frames_on_disk_are_those_of_frames_in_memory(tmp_path, monkeypatch):
+    """Although what they show of the files is given back after every sample."""
+    monkeypatch.setattr(memmap, "_MOST", 0)
+    episodes = make_episodes([12, 9])
+    stored = episodes.with_video(episodes.video[0].memmap(tmp_path))
+    buffers = [window_buffer(each, FK, world_model(), seed=0) for each in (episodes, stored)]
+    for _ in range(3):
+        in_memory, on_disk = (buffer.sample() for buffer in buffers)
+        assert (in_memory == on_disk).all()
 
 
 def test_a_start_outside_its_episode_is_refused():

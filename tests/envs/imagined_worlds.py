@@ -20,8 +20,7 @@ from worldenv_trl.keys import (
 )
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.robot import panda
-from worldenv_trl.world_models import WorldModel
-from worldenv_trl.world_models.base import memory_key
+from worldenv_trl.world_models import WorldModel, memory_key
 
 SIZE, C = 16, 4
 FK = ForwardKinematics()

@@ -54,3 +54,20 @@ def test_what_cannot_be_measured_is_refused(name, settings, message, tmp_path):
     with pytest.raises(SystemExit, match=f"^error: .*{message}"):
         module.main(kind(**settings))
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps_rollup").exists(), reason="memory is read from Linux's /proc")
+def test_the_memory_of_a_stage_is_that_of_its_helpers_too(tmp_path):
+    helper = "import time; x = bytearray(150_000_000); time.sleep(1.5)"
+    starts = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {helper!r}])"
+    costs = benchmark("stage_costs")
+    seconds, _, resident, own = costs.measured([sys.executable, "-c", starts], tmp_path / "log")
+    assert seconds > 1.5 and 150e6 < own < 400e6 and own <= resident
+    with pytest.raises(SystemExit, match="ended with 3: see"):
+        costs.measured([sys.executable, "-c", "raise SystemExit(3)"], tmp_path / "log")
+
+
+@pytest.mark.parametrize("arguments", [["smoke"], ["smoke", "--run-dir", "."]])
+def test_costs_are_measured_in_a_new_folder_alone(arguments):
+    with pytest.raises(SystemExit, match="new --run-dir"):
+        benchmark("stage_costs").main(arguments)

@@ -9,8 +9,7 @@ from tensordict import TensorDictBase
 
 from worldenv_trl.keys import frames_key
 from worldenv_trl.pretrained import Pretrained
-from worldenv_trl.world_models import WorldModel
-from worldenv_trl.world_models.base import memory_key
+from worldenv_trl.world_models import WorldModel, memory_key
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import torch
-from small_models import PULL, PUSH
+from small_models import FRONT, PULL, PUSH
 from tensordict import NonTensorStack, TensorDict
 
 from worldenv_trl.keys import frames_key
-from worldenv_trl.world_models import VideoWorldModel
+from worldenv_trl.kinematics import ActionMap
+from worldenv_trl.world_models import WorldModel
 
 
-def make_windows(model: VideoWorldModel, starts: tuple[int, ...] = (0, 5), chunks: int = 2) -> TensorDict:
+def make_windows(model: WorldModel, starts: tuple[int, ...] = (0, 5), chunks: int = 2) -> TensorDict:
     """Windows [B]: a bright square follows the tool over a dark gradient, on every camera's image.
 
     A window holds all frames of its video, so that place and number are the same.
@@ -22,7 +23,7 @@ def make_windows(model: VideoWorldModel, starts: tuple[int, ...] = (0, 5), chunk
     poses[..., 3:12] = torch.eye(3).flatten()
     axis, frames = torch.arange(32), {}
     for index, camera in enumerate(model.cameras):
-        pixels = model.action_maps[0].project(poses[..., :3], torch.zeros(rows, dtype=torch.int64)) * 2 + 4 * index
+        pixels = ActionMap(FRONT, 32).project(poses[..., :3]) + 4 * index
         inside = (axis - pixels[..., :1]).abs().le(3).unsqueeze(-2) & (axis - pixels[..., 1:]).abs().le(3).unsqueeze(-1)
         video = torch.where(inside.unsqueeze(2), 220 - 30 * index, axis.view(1, 1, 1, 1, 32) * 3)
         frames[frames_key(camera)] = video.expand(rows, length, 3, 32, 32).to(torch.uint8).contiguous()

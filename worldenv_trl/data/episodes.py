@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from worldenv_trl.keys import CONTEXT_ID, FRAMES, TASK_ID, camera_of, frames_key
+from worldenv_trl.memmap import Reading
 
 __all__ = ["Episodes"]
 
@@ -66,6 +67,7 @@ class Episodes:
             raise ValueError(f"the episodes need {int((first + count).max())} frames, there are {len(frames)}")
         self.entries, self.instructions = entries, list(instructions)
         self._parts, self._part, self._first = [frames], torch.zeros_like(first), first
+        self.reading = Reading()
 
     # ------------------------------------------------------------------------------------------------- reading
 
@@ -94,6 +96,7 @@ class Episodes:
         out = Episodes.__new__(Episodes)
         out.entries, out.instructions = entries, instructions
         out._parts, out._part, out._first = self._parts, self._part[rows], self._first[rows]
+        out.reading = self.reading
         return out
 
     @property
@@ -152,6 +155,8 @@ class Episodes:
         return self._part[episode], self._first[episode] + inside
 
     def _gather(self, key: tuple[str, str], part: Tensor, index: Tensor) -> Tensor:
+        size = self.image_size
+        self.reading.add(3 * size * size * index.numel(), *self._parts)
         if len(self._parts) == 1:
             return self._parts[0][key][index]
         out: Tensor | None = None
@@ -211,7 +216,7 @@ class Episodes:
                     stores.append(frames)
                 places.append(known)
             numbers.append(torch.tensor(places)[part._part])
-        out._parts, out._part = stores, torch.cat(numbers)
+        out._parts, out._part, out.reading = stores, torch.cat(numbers), Reading()
         out._first = torch.cat([part._first for part in parts])
         return out
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import torch
-from tensordict import NonTensorStack, TensorDict
+from tensordict import TensorDict
 
 from worldenv_trl.data.episodes import Episodes
 from worldenv_trl.keys import ACTION_IS_PAD, CHUNK, CHUNK_LENGTH, INSTRUCTION, STATE, image_key
+from worldenv_trl.row_texts import row_texts
 
 __all__ = ["policy_samples"]
 
@@ -35,6 +36,6 @@ def policy_samples(episodes: Episodes, chunk_length: int = CHUNK_LENGTH) -> Tens
     out = TensorDict({STATE: episodes["states"][episode, step]}, batch_size=[len(episode)])
     for camera in episodes.cameras:
         out[image_key(camera)] = episodes.frames(camera, episode, step)
-    out.set(INSTRUCTION, NonTensorStack(*(episodes.instructions[row] for row in episode.tolist())))
+    out.set(INSTRUCTION, row_texts([episodes.instructions[row] for row in episode.tolist()]))
     out[CHUNK], out[ACTION_IS_PAD] = chunk, wanted >= end
     return out

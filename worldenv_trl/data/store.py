@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import itertools
 import json
 import logging
 import os
 import shutil
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,14 +20,15 @@ from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 from worldenv_trl.data.episodes import Episodes, check_alike, concatenated
 from worldenv_trl.data.from_rollouts import episodes_from_rollouts
 from worldenv_trl.keys import ACTION, CHUNK
-from worldenv_trl.record import list_rollouts, read_rollouts
+from worldenv_trl.memmap import release
+from worldenv_trl.record import list_rollouts, read_metadata, read_rollouts
+from worldenv_trl.record.mcap.recording import Recording
 
-__all__ = ["FrameSink", "fill_store", "open_store", "release"]
+__all__ = ["FrameSink", "fill_store", "open_store"]
 
 _MANIFEST = "episodes.json"
 _FORMAT = 1
 _AT_ONCE = 16  # rollouts in memory while a recording is read
-_DONTNEED = 4  # of madvise
 
 
 class FrameSink:
@@ -90,11 +89,9 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
     alike: Episodes | None = None
     entries: list[TensorDict] = []
     texts: list[str] = []
-    infos = {path: list_rollouts(path) for path in recordings}
-    capacity = sum(
-        _steps_per_entry(path) * sum(info.length for info in each) + len(each) for path, each in infos.items() if each
-    )
-    for part in (part for path, each in infos.items() for part in _parts(path, len(each))):
+    counts = {path: Recording(Path(path)).count() for path in recordings}
+    capacity = sum(count * (_longest(path) + 1) for path, count in counts.items() if count)
+    for part in (part for path, count in counts.items() for part in _parts(path, count)):
         frames, _ = part.video
         if sink is None or alike is None:
             _check_room(partial, capacity, frames)
@@ -111,7 +108,7 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
     manifest = {
         "format": _FORMAT,
         "recordings": [_identity(path) for path in recordings],
-        "counts": [len(each) for each in infos.values()],
+        "counts": list(counts.values()),
         "frames": len(sink.frames),
         "files": {str(path.relative_to(partial)): path.stat().st_size for path in _files(partial)},
         "instructions": distinct,
@@ -169,20 +166,6 @@ def open_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
         raise ValueError(f"the episode store {folder} is cut short or damaged ({error}): {remedy}") from error
 
 
-def release(frames: TensorDictBase) -> None:
-    """Lets the system take back the memory that shows files of memory-mapped ``frames``; they are read again if needed.
-
-    Does nothing for tensors in memory, nor where there is no ``madvise``.
-    """
-    if not sys.platform.startswith("linux"):
-        return
-    libc = ctypes.CDLL(None)
-    for value in frames.values(True, True):
-        storage = value.untyped_storage()
-        if storage.filename:  # never memory that no file stands behind
-            libc.madvise(ctypes.c_void_p(storage.data_ptr()), ctypes.c_size_t(storage.nbytes()), _DONTNEED)
-
-
 def _files(folder: Path) -> list[Path]:
     """Those of a store's frames and entries."""
     return sorted(path for part in ("frames", "entries") for path in (folder / part).rglob("*") if path.is_file())
@@ -204,10 +187,14 @@ def _parts(path: str | os.PathLike, count: int) -> Iterator[Episodes]:
         yield episodes_from_rollouts(read_rollouts(path, rollouts=slice(start, start + _AT_ONCE)))
 
 
-def _steps_per_entry(path: str | os.PathLike) -> int:
-    """1, or the chunk length of a recording of decisions."""
+def _longest(path: str | os.PathLike) -> int:
+    """No rollout of a recording has more env steps: what its env was limited to, or else what it holds."""
+    limits = read_metadata(path).get("env", {}).get("max_steps")
+    if limits is not None:
+        return int(max(limits)) if isinstance(limits, list) else int(limits)
     one = read_rollouts(path, rollouts=[0])
-    return 1 if one.get(ACTION, None) is not None else one[CHUNK].shape[-2]
+    steps = 1 if one.get(ACTION, None) is not None else one[CHUNK].shape[-2]
+    return steps * max(info.length for info in list_rollouts(path))
 
 
 def _check_room(folder: Path, count: int, frames: TensorDictBase) -> None:

@@ -5,21 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import NonTensorStack, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 
 from worldenv_trl.data.episodes import Episodes
-from worldenv_trl.data.store import release
 from worldenv_trl.keys import FRAMES, INSTRUCTION, TASK_ID
 from worldenv_trl.kinematics import ForwardKinematics
+from worldenv_trl.row_texts import row_texts
 from worldenv_trl.world_models import WorldModel
 
 __all__ = ["WindowBuffer", "WindowSampler", "predicted_poses", "window_buffer"]
-
-_RELEASE_EVERY = 32  # samples; what they show of the files is then given back
 
 
 @torch.no_grad()
@@ -151,15 +149,13 @@ class WindowBuffer(ReplayBuffer):
             writer=ImmutableDatasetWriter(),
             batch_size=batch_size,
         )
-        self._episodes, self._poses, self._drawn = episodes, poses, 0
+        self._episodes, self._poses = episodes, poses
 
     def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
         """Windows [B]; see :func:`window_buffer`."""
         frames, info = super().sample(batch_size, return_info=True)
         windows = self.windows(frames, info)
-        self._drawn += 1
-        if self._drawn % _RELEASE_EVERY == 0:
-            release(self._episodes.video[0])
+        self._episodes.reading.add(frames.bytes(), self._episodes.video[0])
         return (windows, info) if return_info else windows
 
     def state_dict(self) -> dict[str, Any]:
@@ -187,7 +183,7 @@ class WindowBuffer(ReplayBuffer):
             },
             batch_size=[len(episode)],
         )
-        out.set(INSTRUCTION, NonTensorStack(*(episodes.instructions[index] for index in episode.tolist())))
+        out.set(INSTRUCTION, row_texts([episodes.instructions[index] for index in episode.tolist()]))
         return out
 
 

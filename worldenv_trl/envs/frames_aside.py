@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import tempfile
 
-import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import LazyStackedTensorDict, TensorDictBase
 from torchrl.data import Composite
 from torchrl.envs.transforms import Transform
 
 from worldenv_trl.keys import FRAMES
+from worldenv_trl.memmap import release
 
 __all__ = ["FramesAside"]
 
@@ -34,15 +34,16 @@ class FramesAside(Transform):
         self._folder: tempfile.TemporaryDirectory | None = None
         self._decisions: list[TensorDictBase] = []
 
-    def frames(self) -> TensorDict:
-        """``("frames", entry)`` uint8 [*B, D, C, 3, H, W] of the D decisions since the reset, from their files.
+    def frames(self) -> TensorDictBase:
+        """``("frames", entry)`` uint8 [*B, D, C, 3, H, W] of the D decisions since the reset, from their files: what is
+        indexed is read.
 
         Raises:
             RuntimeError: if :attr:`keep` was not set when they were made.
         """
         if not self._decisions:
             raise RuntimeError("no frames were kept: set keep to True before the env is reset")
-        return torch.stack(self._decisions, -1)
+        return LazyStackedTensorDict.lazy_stack(self._decisions, self._decisions[0].ndim)
 
     def _reset(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -57,6 +58,7 @@ class FramesAside(Transform):
         if self._folder is not None:
             shown = next_tensordict.select(FRAMES)
             self._decisions.append(shown.memmap(f"{self._folder.name}/{len(self._decisions)}"))
+            release(self._decisions[-1])
         return next_tensordict.exclude(FRAMES)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

@@ -16,7 +16,6 @@ from torchrl.envs import EnvBase
 
 from worldenv_trl.context_ids import UNKNOWN_CONTEXT
 from worldenv_trl.envs.init_states import InitStates
-from worldenv_trl.envs.row_texts import row_texts
 from worldenv_trl.envs.tabletop_arguments import (
     check_cameras,
     check_counts,
@@ -41,6 +40,7 @@ from worldenv_trl.keys import (
     TASK_ID,
     image_entry,
 )
+from worldenv_trl.row_texts import row_texts
 from worldenv_trl.scenes import RendererPool, SceneBatch, Task
 from worldenv_trl.scenes.simulation import measured_states, step_together
 

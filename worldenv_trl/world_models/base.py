@@ -6,12 +6,13 @@ import abc
 from collections.abc import Callable, Sequence
 
 import torch
-from tensordict import NonTensorStack, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from worldenv_trl.keys import ACTION_DIM, INSTRUCTION, NOISE_SEED, frames_key, image_entry
 from worldenv_trl.language import SeenInstructions
+from worldenv_trl.row_texts import row_texts
 
 __all__ = ["PADDED_ACTIONS", "PADDED_ACTION_DIM", "POSES", "Recall", "WorldModel", "request"]
 
@@ -138,7 +139,7 @@ def request(
     out[MEMORY_POSES] = memory[POSES]
     out[POSES] = poses
     out[PADDED_ACTIONS] = torch.nn.functional.pad(actions, (0, PADDED_ACTION_DIM - ACTION_DIM))
-    out.set(INSTRUCTION, NonTensorStack(*instructions))
+    out.set(INSTRUCTION, row_texts(instructions))
     if noise_seed is not None:
         out[NOISE_SEED] = noise_seed
     return out
