@@ -19,7 +19,7 @@ def check_config(config: WorldEnvConfig) -> None:
     ):
         if value not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
-    for name, value in (
+    counts = (
         ("num_threads", config.num_threads),
         ("rounds", config.rounds),
         ("train_states", config.train_states),
@@ -31,23 +31,24 @@ def check_config(config: WorldEnvConfig) -> None:
         ("post_train.iterations", config.post_train.iterations),
         ("post_train.groups", config.post_train.groups),
         ("evaluate.episodes_per_task", config.evaluate.episodes_per_task),
-    ):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+    )
+    for name, count in counts:
+        if count < 1:
+            raise ValueError(f"{name} must be at least 1, got {count}")
     if config.post_train.group_size < 2:
         raise ValueError(f"post_train.group_size must be at least 2, got {config.post_train.group_size}")
     if not config.explore.scale_factors or min(config.explore.scale_factors) < 0:
         raise ValueError(
             f"explore.scale_factors must be one number or more, none negative, got {config.explore.scale_factors}"
         )
-    for name, value in (
+    for name, share in (
         ("world_model.failure_share", config.world_model.failure_share),
         ("world_model.holdout", config.world_model.holdout),
         ("reflector.imagined_share", config.reflector.imagined_share),
         ("reflector.holdout", config.reflector.holdout),
     ):
-        if value is not None and not 0 <= value <= 1:
-            raise ValueError(f"{name} must lie between 0 and 1, got {value}")
+        if share is not None and not 0 <= share <= 1:
+            raise ValueError(f"{name} must lie between 0 and 1, got {share}")
     if not all(floor > 0 for floor in config.scale_floor):
         raise ValueError(f"scale_floor must be positive, got {config.scale_floor}")
     if not 0 <= config.scale_share <= 1:

@@ -5,6 +5,8 @@ Alone: ``python recipes/explore.py improve --run-dir runs/improve``.
 
 from __future__ import annotations
 
+from typing import Any
+
 from tqdm import tqdm
 
 from physics import chunk_player, exploring_actor, recording, step_env
@@ -23,7 +25,11 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
     per_scale = -(-settings.episodes_per_task * len(config.tasks) // len(settings.scale_factors))
     waves = -(-per_scale // settings.num_envs)
     # After success the rollout goes on: the models must see what undoes it (World-Env Figure 6).
-    options = {"terminate_on_success": False, "with_sim_state": True, "seed": config.seed + 1000 * len(target)}
+    options: dict[str, Any] = {
+        "terminate_on_success": False,
+        "with_sim_state": True,
+        "seed": config.seed + 1000 * len(target),
+    }
     env = step_env(config, "train", settings.num_envs, **options)
     about = recording(config, env, target, {"policy": model}, policy=policy)
     with RolloutWriter(folder.rollouts(target), **about, overwrite=True) as writer:

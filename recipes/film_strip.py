@@ -87,7 +87,7 @@ def draw(worlds: TwoWorlds, tasks: tuple[str, ...], settings: Settings) -> None:
     plt.close(figure)
 
 
-def _curve(axes, worlds: TwoWorlds, row: int, task: str, steps: torch.Tensor) -> None:
+def _curve(axes: plt.Axes, worlds: TwoWorlds, row: int, task: str, steps: torch.Tensor) -> None:
     length = int(worlds.episodes["length"][row]) + 1
     for scores, colour, name in (
         (worlds.real_scores, REAL, "R on real frames"),

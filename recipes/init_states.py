@@ -44,6 +44,7 @@ def main(settings: Settings) -> None:
 def store(name: str, count: int) -> list[str]:
     """Draws and stores the states of a task; what there is to say about it."""
     task = load_task(name)
+    assert task.states is not None  # a suite's
     redrawn = save_poses(task, task.states, count, partial(solved_by_expert, task))
     lines = [f"{name}: {count} + {count} states, {task.states.stat().st_size / 1024:.0f} kB"]
     for split, times in redrawn.items():

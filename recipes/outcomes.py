@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
@@ -31,7 +34,7 @@ class Judge:
 
 def physics_outcomes(
     run: Run,
-    actor,
+    actor: TensorDictModuleBase,
     task: str,
     split: str,
     episodes: int,
@@ -46,7 +49,7 @@ def physics_outcomes(
     The goal predicate ends an episode, or, with a ``judge``, the reflector alone does: then success is whether the
     goal holds in the moment it stops (or at the step limit).
     """
-    options = {"init_state_count": episodes}
+    options: dict[str, Any] = {"init_state_count": episodes}
     if indices is not None:  # these initial states of the split only
         task_id, episodes = run.config.tasks.index(task), len(indices)
         options = {
@@ -78,7 +81,7 @@ def physics_outcomes(
     return torch.tensor([outcome[number] for number in sorted(outcome)][:episodes])
 
 
-def outcomes_env(run: Run, task: str, split: str, num_envs: int, judge: Judge | None, **options) -> TransformedEnv:
+def outcomes_env(run: Run, task: str, split: str, num_envs: int, judge: Judge | None, **options: Any) -> TransformedEnv:
     """Initial states in order; the goal predicate ends an episode or, with a ``judge``, the reflector alone."""
     options = {"init_state_mode": "cycle", "terminate_on_success": judge is None} | options
     env = tabletop(run.config, split, num_envs, [task], **options)
@@ -87,7 +90,9 @@ def outcomes_env(run: Run, task: str, split: str, num_envs: int, judge: Judge | 
     return chunked(env, run.config.chunk_length)
 
 
-def imagined_outcomes(run: Run, actor, imagination: Imagination, contexts) -> torch.Tensor:
+def imagined_outcomes(
+    run: Run, actor: TensorDictModuleBase, imagination: Imagination, contexts: TensorDict
+) -> torch.Tensor:
     """Whether the reflector stops the greedy policy in imagination, bool ``[K]``, for each context in order."""
     env = imagination.env(run, [len(contexts), 1], contexts)
     collector = GroupCollector(
@@ -104,7 +109,9 @@ def imagined_outcomes(run: Run, actor, imagination: Imagination, contexts) -> to
     return torch.tensor([order[number] for number in contexts[keys.CONTEXT_ID].squeeze(-1).tolist()])
 
 
-def greedy_outcomes(run: Run, actor, imagination: Imagination, per_task: int) -> tuple[torch.Tensor, torch.Tensor]:
+def greedy_outcomes(
+    run: Run, actor: TensorDictModuleBase, imagination: Imagination, per_task: int
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Greedy success on up to ``per_task`` training contexts of every task: ``(real, imagined)``, bool ``[K]``.
 
     They are spread over all contexts: the first ones are the demonstrations' own.

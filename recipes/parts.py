@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from torch import nn
+
 from config import WorldEnvConfig
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.policies import OFTConfig, OFTPolicy, Policy
@@ -16,7 +18,7 @@ from worldenv_trl.world_models import VideoWorldModel, VideoWorldModelConfig, Wo
 
 PROPRIO = "commanded"  # the same in physics and imagination, so the policy meets no gap between them
 
-Kind = TypeVar("Kind")
+Kind = TypeVar("Kind", bound=nn.Module)
 
 
 @dataclass(frozen=True)

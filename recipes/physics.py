@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker, TransformedEnv
@@ -15,7 +16,9 @@ from worldenv_trl.policies import LaplaceActor, Policy, laplace_actor, scale_bou
 from worldenv_trl.record import provenance
 
 
-def tabletop(config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[str] | None, **options) -> TabletopEnv:
+def tabletop(
+    config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[str] | None, **options: Any
+) -> TabletopEnv:
     """Some of the run's tasks (all by default), each under its number in the run."""
     tasks = list(config.tasks if tasks is None else tasks)
     options = {"seed": config.seed, "num_threads": config.num_threads, "cameras": config.cameras} | options
@@ -34,7 +37,7 @@ def tabletop(config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[
 
 
 def step_env(
-    config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[str] | None = None, **options
+    config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[str] | None = None, **options: Any
 ) -> TransformedEnv:
     """Physics, one action a step (every frame is seen), with the ``is_init`` that :func:`chunk_player` needs."""
     return TransformedEnv(tabletop(config, split, num_envs, tasks, **options), InitTracker())
@@ -59,7 +62,7 @@ def exploring_actor(config: WorldEnvConfig, policy: Policy, scale_factor: float)
     return laplace_actor(policy, scale_factor=scale_factor, log_scale_bounds=bounds)
 
 
-def recording(config: WorldEnvConfig, env: EnvBase, stage: str, models: dict | None = None, **more) -> dict:
+def recording(config: WorldEnvConfig, env: EnvBase, stage: str, models: dict | None = None, **more: Any) -> dict:
     """What a recording of a stage must say about itself, so that it can be replayed: options of RolloutWriter."""
     more = {"stage": stage, "seed": config.seed} | more
     return provenance(env, models=models, config=config, tasks=config.tasks, **more)

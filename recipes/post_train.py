@@ -7,6 +7,7 @@ Alone: ``python recipes/post_train.py improve --run-dir runs/improve``.
 from __future__ import annotations
 
 import time
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -24,7 +25,7 @@ from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import FramesAside
 from worldenv_trl.metrics import HonestyAlarm
 from worldenv_trl.objectives import LOOPLoss, rloo_advantage
-from worldenv_trl.policies import laplace_actor
+from worldenv_trl.policies import Policy, laplace_actor
 from worldenv_trl.record import RolloutWriter
 
 
@@ -58,7 +59,8 @@ def post_train(run: Run, source: str, target: str, models: str) -> None:
     full_rates = [group["lr"] for group in optimizer.param_groups]
     # Single iterations are noisy: what is probed and saved is a running mean of the weights they reach.
     mean = AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(settings.averaging))
-    mean_actor = laplace_actor(mean.module)
+    averaged = cast(Policy, mean.module)
+    mean_actor = laplace_actor(averaged)
 
     probed, recorded = probed_iterations(settings), {0, settings.iterations - 1}
     alarm = HonestyAlarm(len(probed), false_alarm_rate=settings.false_alarm_rate) if probed and imagination else None
@@ -101,7 +103,7 @@ def post_train(run: Run, source: str, target: str, models: str) -> None:
         del wave  # before the next one is collected
         _record_next(iteration + 1 in recorded, collector, aside)
     collector.shutdown()
-    mean.module.save_pretrained(run.folder.checkpoint(target))
+    averaged.save_pretrained(run.folder.checkpoint(target))
 
 
 def _record_next(yes: bool, collector: GroupCollector, aside: FramesAside | None) -> None:
@@ -122,7 +124,7 @@ def _write(run: Run, name: str, about: dict, wave: TensorDictBase, aside: Frames
             writer.write(part)
 
 
-def _wave_metrics(wave, returns, tasks: tuple[str, ...]) -> dict[str, float]:
+def _wave_metrics(wave: TensorDictBase, returns: torch.Tensor, tasks: tuple[str, ...]) -> dict[str, float]:
     mask = wave[keys.MASK]
     ended = (wave["next", "terminated"].squeeze(-1) & mask).any(-1)
     metrics = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 
 from config import PostTrain
 from imagination import Imagination
@@ -18,14 +19,16 @@ def probed_iterations(settings: PostTrain) -> set[int]:
     return {*range(0, settings.iterations, settings.probe_every), settings.iterations - 1}
 
 
-def probe(run: Run, actor, imagination: Imagination | None, alarm: HonestyAlarm | None) -> dict[str, float]:
+def probe(
+    run: Run, actor: TensorDictModuleBase, imagination: Imagination | None, alarm: HonestyAlarm | None
+) -> dict[str, float]:
     """Greedy success on training contexts: in the physics (the reflector not involved) and in imagination."""
     config = run.config
     count = config.post_train.probe_contexts
-    if imagination is None:
+    if imagination is None or alarm is None:  # one comes with the other
         indices = torch.linspace(0, config.train_states - 1, min(count, config.train_states)).long().tolist()
-        real = [physics_outcomes(run, actor, task, "train", len(indices), indices=indices) for task in config.tasks]
-        return {"real_success": torch.cat(real).float().mean().item(), "probe_episodes": len(torch.cat(real))}
+        tasks = [physics_outcomes(run, actor, task, "train", len(indices), indices=indices) for task in config.tasks]
+        return {"real_success": torch.cat(tasks).float().mean().item(), "probe_episodes": len(torch.cat(tasks))}
     real, imagined = greedy_outcomes(run, actor, imagination, count)
     report = honesty(imagined, real)
     watch = alarm.update(imagined, real)

@@ -19,7 +19,7 @@ from pathlib import Path
 import tyro
 
 from command_line import one_line_errors
-from parts import COMPACT, Part, Parts
+from parts import COMPACT, Kind, Part, Parts
 from worldenv_trl.policies import laplace_actor
 from worldenv_trl.record import model_hash, parse_edit, read_metadata, replay
 from worldenv_trl.record.replay.source import open_rollout
@@ -100,7 +100,7 @@ def main(options: Options, parts: Parts = COMPACT) -> int:
     return 0
 
 
-def _checkpoint(part: Part, name: str | None, file: Path, metadata: dict, kind: str):
+def _checkpoint(part: Part[Kind], name: str | None, file: Path, metadata: dict, kind: str) -> Kind:
     """A checkpoint by name or folder; without one, that of the run with the recorded hash, else the newest."""
     folder = file.resolve().parent.parent / "checkpoints"
     if name is not None and name != "recorded":

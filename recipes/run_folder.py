@@ -125,9 +125,9 @@ class RunFolder:
         self.log(name, seconds=seconds)
         _write_atomically(marker, f"{seconds:.1f}\n")
 
-    def log(self, stage: str, step: int | None = None, **values: Any) -> None:
+    def log(self, stage: str, **values: Any) -> None:
         """Appends one line to ``metrics.jsonl``."""
-        line = {"stage": stage} | ({} if step is None else {"step": step}) | _plain(values)
+        line = {"stage": stage} | _plain(values)
         with self.metrics_path.open("a") as file:
             file.write(json.dumps(line) + "\n")
 

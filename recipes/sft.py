@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import math
 import warnings
+from typing import Any
 
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.objectives import BCLoss
 from tqdm import trange
 
@@ -42,7 +45,7 @@ def fine_tune(run: Run) -> None:
     policy.save_pretrained(run.folder.checkpoint("sft"))
 
 
-def _behaviour_cloning(actor, **options) -> BCLoss:
+def _behaviour_cloning(actor: TensorDictModuleBase, **options: Any) -> BCLoss:
     with warnings.catch_warnings():  # about its own annotations
         warnings.simplefilter("ignore", UserWarning)
         loss = BCLoss(actor, **options)
@@ -50,7 +53,15 @@ def _behaviour_cloning(actor, **options) -> BCLoss:
     return loss
 
 
-def _train(loss, samples, parameters, steps: int, lr: float, run: Run, name: str) -> None:
+def _train(
+    loss: BCLoss,
+    samples: TensorDictBase,
+    parameters: list[torch.nn.Parameter],
+    steps: int,
+    lr: float,
+    run: Run,
+    name: str,
+) -> None:
     settings, images = run.config.sft, [keys.image_key(camera) for camera in run.config.cameras]
     optimizer = torch.optim.AdamW(parameters, lr=lr, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import FrameType
 from typing import Any
 
 import torch
@@ -45,17 +46,17 @@ def plan(config: WorldEnvConfig) -> list[Stage]:
     policy, previous, models = "sft", None, ""
     for number in range(1, config.rounds + 1):
         models = "" if number == 1 else f"_{number}"
-        explored, world, judge, improved = (
+        explored, world, reflector, improved = (
             f"{name}{models}" for name in ("explore", "world_model", "reflector", "post_train")
         )
         see = {"policy": policy, "target": explored}
         dream = {"target": world, "previous": previous, "rounds": number}
-        score = {"target": judge, "models": models, "rounds": number}
+        score = {"target": reflector, "models": models, "rounds": number}
         learn = {"source": policy, "target": improved, "models": models}
         stages += [
             Stage(explored, "explore", f"rollouts/{explored}.mcap", see),
             Stage(world, "train_world_model", f"checkpoints/{world}", dream),
-            Stage(judge, "train_reflector", f"checkpoints/{judge}", score),
+            Stage(reflector, "train_reflector", f"checkpoints/{reflector}", score),
             Stage(improved, "post_train", f"checkpoints/{improved}", learn),
         ]
         policy, previous = improved, world
@@ -118,7 +119,7 @@ def _run(stage: Stage, work: Work, run: Run) -> None:
     """Runs a stage; Ctrl-C ends the program with one line, wherever it strikes."""
     interrupted = threading.Event()
 
-    def interrupt(number: int, frame: object) -> None:
+    def interrupt(number: int, frame: FrameType | None) -> None:
         interrupted.set()
         signal.default_int_handler(number, frame)
 

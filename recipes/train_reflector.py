@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
+from typing import cast
 
 import torch
 from tqdm import trange
@@ -19,6 +20,7 @@ from worldenv_trl import keys
 from worldenv_trl.data import Episodes, imagine_episodes, score_episodes
 from worldenv_trl.metrics import choose_rule, frame_figures, stop_figures
 from worldenv_trl.objectives import ReflectorLoss
+from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.reflectors import Reflector, StopRule
 
 # Frames by which the goal may come after the stop: imagined time is not exact, in front of a camera the stop is final.
@@ -53,12 +55,12 @@ def train_reflector(run: Run, target: str = "reflector", models: str = "", round
         }
     rules = dict.fromkeys(scores, StopRule(settings.threshold, settings.consecutive))
     if settings.choose_threshold:  # on training contexts that no part of the reflector has seen
-        task = held_out[keys.TASK_ID].squeeze(-1)
+        number = held_out[keys.TASK_ID].squeeze(-1)
         rules = {
-            name: choose_rule(values, held_out["success"], held_out.alive, task, LATE[name])
+            name: choose_rule(values, held_out["success"], held_out.alive, number, LATE[name])
             for name, values in scores.items()
         }
-    write_rules(reflector.save_pretrained(run.folder.checkpoint(target)), rules)
+    write_rules(cast(Pretrained, reflector).save_pretrained(run.folder.checkpoint(target)), rules)
     for name, values in scores.items():
         for task in ("all", *config.tasks):
             rows = torch.ones(len(held_out), dtype=torch.bool)
@@ -87,7 +89,9 @@ def learn(run: Run, reflector: Reflector, episodes: Episodes, target: str) -> No
                 run.folder.log(target, step=step, **figures)
 
 
-def _log_figures(run: Run, target: str, rule: StopRule, rollouts: str, task: str, scores, episodes: Episodes) -> None:
+def _log_figures(
+    run: Run, target: str, rule: StopRule, rollouts: str, task: str, scores: torch.Tensor, episodes: Episodes
+) -> None:
     success, alive = episodes["success"], episodes.alive
     run.folder.log(
         target,

@@ -15,7 +15,7 @@ from tqdm import trange
 from episodes import demonstrations_and_exploration, split_by_context
 from run import Run
 from stages import run_alone
-from worldenv_trl.data import Episodes, imagine_episodes, window_buffer
+from worldenv_trl.data import Episodes, WindowBuffer, imagine_episodes, window_buffer
 from worldenv_trl.metrics import moving_pixel_psnr, psnr
 from worldenv_trl.objectives import WorldModelLoss
 from worldenv_trl.world_models import WorldModel
@@ -44,7 +44,9 @@ def train_world_model(run: Run, target: str = "world_model", previous: str | Non
     run.folder.log(target, episodes=len(training), held_out=len(held_out), **figures)
 
 
-def _train(run: Run, model: WorldModel, parameters: list[torch.nn.Parameter], windows, steps: int, target: str) -> None:
+def _train(
+    run: Run, model: WorldModel, parameters: list[torch.nn.Parameter], windows: WindowBuffer, steps: int, target: str
+) -> None:
     settings, loss = run.config.world_model, WorldModelLoss(model)
     optimizer = torch.optim.AdamW(parameters, lr=settings.lr, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType
 
@@ -46,7 +47,7 @@ class TwoWorlds:
         return judged(self.imagined_stop, self.reached, late)
 
 
-def live(run: Run, actor, per_task: int, split: str = "test") -> Episodes:
+def live(run: Run, actor: TensorDictModuleBase, per_task: int, split: str = "test") -> Episodes:
     """Greedy episodes of every task in the physics, each to the step limit whether the goal is reached or not.
 
     Returns:

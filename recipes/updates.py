@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
+from tensordict import NestedKey, TensorDictBase
 
 from config import PostTrain
 from worldenv_trl import keys
 from worldenv_trl.language import instructions_of
+from worldenv_trl.objectives import LOOPLoss
 from worldenv_trl.row_texts import row_texts
 
 PATIENCE = 3  # iterations
@@ -25,7 +28,14 @@ def rate_factor(iteration: int, settings: PostTrain) -> float:
     return min(warmup, 0.55 + 0.45 * math.cos(math.pi * iteration / settings.iterations))
 
 
-def update(wave, in_keys, loss, optimizer, parameter_groups, settings: PostTrain) -> dict[str, float]:
+def update(
+    wave: TensorDictBase,
+    in_keys: Sequence[NestedKey],
+    loss: LOOPLoss,
+    optimizer: torch.optim.Optimizer,
+    parameter_groups: Sequence[list[torch.nn.Parameter]],
+    settings: PostTrain,
+) -> dict[str, float]:
     """K epochs of clipped updates on the decisions of a wave, stopped when the policy has moved too far.
 
     Args:

@@ -21,12 +21,12 @@ from explore import explore
 from parts import COMPACT, Parts
 from post_train import post_train
 from sft import fine_tune
-from stages import open_run, parse, run_stages
+from stages import Work, open_run, parse, run_stages
 from train_reflector import train_reflector
 from train_world_model import train_world_model
 from worldenv_trl.report import plot_run, summary_table
 
-WORKS = {
+WORKS: dict[str, Work] = {
     "demonstrate": demonstrate,
     "sft": fine_tune,
     "explore": explore,
