@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 __all__ = ["Reading", "release"]
 
 _DONTNEED = 4  # of madvise
-_MOST = 256_000_000  # bytes that are read before they are given back
+_MOST = 128_000_000  # bytes that are read before they are given back
 
 
 class Reading:

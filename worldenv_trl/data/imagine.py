@@ -25,7 +25,7 @@ def imagine_episodes(
     episodes: Episodes,
     kinematics: ForwardKinematics,
     *,
-    rows_at_once: int = 64,
+    rows_at_once: int = 16,
     seed: int = 0,
     progress: str | None = None,
     folder: str | os.PathLike | None = None,
