@@ -250,9 +250,9 @@ def test_a_sampler_restored_from_its_state_continues_the_same_draws():
 
 
 def test_episodes_that_the_model_cannot_see_are_refused():
-    with pytest.raises(ValueError, match="sees through agentview, wrist, the episodes show agentview"):
+    with pytest.raises(ValueError, match="the world model looks at 'wrist', the episodes show 'agentview' only"):
         window_buffer(make_episodes([12], cameras=["agentview"]), FK, world_model())
-    with pytest.raises(ValueError, match="sees 8 px images, the episodes' are 16 px"):
+    with pytest.raises(ValueError, match="looks at frames of 8 px, the episodes' are 16 px"):
         window_buffer(make_episodes([12], size=16), FK, world_model())
 
 

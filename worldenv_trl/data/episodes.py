@@ -114,6 +114,20 @@ class Episodes:
         """Which frames belong to their episode: bool [R, T + 1]."""
         return torch.arange(self["actions"].shape[1] + 1) <= self["length"]
 
+    def require(self, part: str, cameras: Sequence[str], image_size: int | None) -> None:
+        """Raises ``ValueError`` unless these episodes show what ``part`` ("the reflector") looks at."""
+        missing = [camera for camera in cameras if camera not in self.cameras]
+        if missing:
+            raise ValueError(
+                f"{part} looks at {', '.join(map(repr, missing))}, the episodes show "
+                f"{', '.join(map(repr, self.cameras))} only: record them with cameras={tuple(cameras)}"
+            )
+        if image_size not in (None, self.image_size):
+            raise ValueError(
+                f"{part} looks at frames of {image_size} px, the episodes' are {self.image_size} px: "
+                f"record them with image_size={image_size}"
+            )
+
     @property
     def video(self) -> tuple[TensorDictBase, Tensor]:
         """All frames [F] and, int64 [R], which of them is each episode's first.

@@ -46,7 +46,11 @@ def imagine_episodes(
     Returns:
         Episodes with the model's cameras alone, whose frames are imagined (the first is real) and whose
         ``kinematic_states`` are predicted; ``success`` stays that of the physics under the same actions.
+
+    Raises:
+        ValueError: for episodes that do not show the model's cameras at its size.
     """
+    episodes.require("the world model", world_model.cameras, world_model.image_size)
     sink = FrameSink(int((episodes["length"] + 1).sum()), folder)
     states = []
     for start in tqdm(range(0, len(episodes), rows_at_once), desc=progress, unit="batch", disable=progress is None):

@@ -17,7 +17,11 @@ def score_episodes(reflector: Reflector, episodes: Episodes, *, rows_at_once: in
 
     Keyword Args:
         rows_at_once: episodes whose frames are in memory at a time.
+
+    Raises:
+        ValueError: for episodes that do not show the reflector's cameras at its size.
     """
+    episodes.require("the reflector", reflector.cameras, reflector.image_size)
     steps = torch.arange(1, episodes["actions"].shape[1] + 1)
     parts = []
     for start in range(0, len(episodes), rows_at_once):

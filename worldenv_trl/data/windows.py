@@ -227,16 +227,7 @@ def window_buffer(
         (torch.Size([2, 12, 3, 64, 64]), torch.Size([2, 8, 7]))
         >>> WorldModelLoss(model)(windows)["loss_world_model"].backward()
     """
-    missing = [camera for camera in world_model.cameras if camera not in episodes.cameras]
-    if missing:
-        raise ValueError(
-            f"the world model sees through {', '.join(world_model.cameras)}, the episodes show "
-            f"{', '.join(episodes.cameras)}: record with cameras={world_model.cameras}"
-        )
-    if episodes.image_size != world_model.image_size:
-        raise ValueError(
-            f"the world model sees {world_model.image_size} px images, the episodes' are {episodes.image_size} px"
-        )
+    episodes.require("the world model", world_model.cameras, world_model.image_size)
     episodes = episodes.through(world_model.cameras)
     sampler = WindowSampler(episodes, world_model, **options)
     return WindowBuffer(episodes, predicted_poses(episodes, kinematics), sampler, batch_size)

@@ -102,17 +102,7 @@ def lessons_of(reflector: CompactReflector, episodes: Episodes) -> Iterator[Less
 
 
 def _check(reflector: CompactReflector, episodes: Episodes) -> None:
-    missing = [camera for camera in reflector.cameras if camera not in episodes.cameras]
-    if missing:
-        raise ValueError(
-            f"the reflector looks at {', '.join(map(repr, missing))}, the episodes show "
-            f"{', '.join(map(repr, episodes.cameras))} only: record them with cameras={reflector.cameras}"
-        )
-    if episodes.image_size != reflector.image_size:
-        raise ValueError(
-            f"the reflector looks at frames of {reflector.image_size} px, the episodes' are {episodes.image_size} px: "
-            f"record them with image_size={reflector.image_size}"
-        )
+    episodes.require("the reflector", reflector.cameras, reflector.image_size)
     unknown = sorted(set(episodes.instructions) - set(reflector.instructions))
     if unknown:
         raise ValueError(
