@@ -1,8 +1,8 @@
 """One folder per run: what every stage reads from and writes to.
 
-``checkpoints/`` learned parts, ``rollouts/*.mcap`` logged rollouts, ``metrics.jsonl`` one line a measurement,
-``plots/*.png``, ``config.yaml`` the exact settings, ``versions.json`` the packages it ran with, ``stages/`` one marker
-per finished stage, ``report.html``.
+``checkpoints/`` learned parts, ``rollouts/*.mcap`` logged rollouts, ``episodes/`` their frames, memory-mapped (a cache),
+``metrics.jsonl`` one line a measurement, ``plots/*.png``, ``config.yaml`` the exact settings, ``versions.json`` the
+packages it ran with, ``stages/`` one marker per finished stage, ``report.html``.
 """
 
 from __future__ import annotations
