@@ -1,6 +1,6 @@
 """One folder per run: what every stage reads from and writes to.
 
-``checkpoints/`` learned parts, ``rollouts/*.mcap`` logged rollouts, ``episodes/`` their frames, memory-mapped (a cache),
+``checkpoints/`` learned parts, ``rollouts/*.mcap`` logged rollouts, ``episodes/`` their frames on disk (a cache),
 ``metrics.jsonl`` one line a measurement, ``plots/*.png``, ``config.yaml`` the exact settings, ``versions.json`` the
 packages it ran with, ``stages/`` one marker per finished stage, ``report.html``.
 """
