@@ -57,10 +57,12 @@ def check_config(config: WorldEnvConfig) -> None:
         raise ValueError(f"image_size must be a multiple of 16 px and at least 32, got {config.image_size}")
     if config.max_steps < 1 or config.max_steps % config.chunk_length:
         raise ValueError(f"max_steps must be a multiple of chunk_length={config.chunk_length}, got {config.max_steps}")
-    names = [load_task(task).name for task in config.tasks]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"two of the tasks are called {name!r}: rename one of the files")
+    digests: dict[str, str] = {}
+    for name in config.tasks:
+        digest = load_task(name).digest
+        if digest in digests:
+            raise ValueError(f"tasks names a task twice: {digests[digest]} and {name} say the same")
+        digests[digest] = name
     cell = 2 * config.world_model.patch
     if config.image_size % cell:
         raise ValueError(

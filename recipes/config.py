@@ -144,7 +144,7 @@ class WorldEnvConfig:
     num_threads: int = 2
     """CPU threads. Beside other jobs 1 is faster: threads that wait for a busy core make all wait."""
     tasks: tuple[str, ...] = GOAL_TASKS
-    """``suite/name``, each once; ``task_id`` is the place in this list."""
+    """``suite/name`` or a ``.bddl`` file, each once; ``task_id`` is the place in this list."""
     cameras: tuple[str, ...] = ("agentview",)
     """Cameras that every part sees through: ``agentview``, ``wrist`` and any other that the scenes have."""
     image_size: int = 64

@@ -49,7 +49,10 @@ def demonstrate(run: Run) -> None:
 
 def check_solved(task: str, solved: torch.Tensor) -> None:
     if not solved.all():
-        raise RuntimeError(f"the expert solved {int(solved.sum())} of {len(solved)} demonstrations of {task}")
+        raise RuntimeError(
+            f"the expert solved {int(solved.sum())} of {len(solved)} demonstrations of {task}: "
+            "give it more --max-steps, or see where it fails with recipes/show_scenes.py"
+        )
 
 
 if __name__ == "__main__":

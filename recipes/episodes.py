@@ -26,7 +26,7 @@ def demonstrations_and_exploration(run: Run, rounds: int) -> tuple[Episodes, Epi
     except FileNotFoundError:
         parts = fill_store(store, files)
     except ValueError as error:  # the recordings are the record: nothing is lost with a store
-        print(f"{error}; it is made anew")
+        print(f"{str(error).split(': fill_store')[0]}: it is made anew from the recordings")
         parts = fill_store(store, files)
     return parts[0], Episodes.cat(parts[1:])
 

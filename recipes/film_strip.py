@@ -1,6 +1,6 @@
 """A picture of what a run imagines: the same actions in the physics and in the world model, and what R makes of both.
 
-``python recipes/film_strip.py runs/improve --out film_strip.png``: one held-out initial state of each task, the
+``python recipes/film_strip.py runs/improve``: one held-out initial state of each task, the
 post-trained policy, greedy.
 """
 
@@ -32,7 +32,8 @@ REAL, IMAGINED = "#1f6f8b", "#c8553d"
 class Settings:
     run: tyro.conf.Positional[Path]
     """Run folder of recipes/world_env.py."""
-    out: Path = Path("film_strip.png")
+    out: Path | None = None
+    """The picture; film_strip.png in the run folder if not given."""
     policy: str = "post_train"
     """Checkpoint that acts."""
     state: int = 0
@@ -54,19 +55,20 @@ def main(settings: Settings) -> None:
     episodes = live(run, actor, count)
     rows = torch.arange(len(config.tasks)) * count + settings.state
     worlds = imagine(run, *models, episodes[rows])
-    draw(worlds, config.tasks, settings)
-    print(f"{settings.out}: {settings.out.stat().st_size / 1e3:,.0f} kB")
+    out = settings.run / "film_strip.png" if settings.out is None else settings.out
+    draw(worlds, config.tasks, settings.columns, out)
+    print(f"{out}: {out.stat().st_size / 1e3:,.0f} kB")
 
 
-def draw(worlds: TwoWorlds, tasks: tuple[str, ...], settings: Settings) -> None:
+def draw(worlds: TwoWorlds, tasks: tuple[str, ...], columns: int, out: Path) -> None:
     cameras, count = worlds.imagined.cameras, len(worlds.episodes)
     lines = 2 * len(cameras)
     heights = [*[1] * lines, 0.9, 0.35] * count
-    figure = plt.figure(figsize=(1.15 * settings.columns + 1.4, 1.15 * sum(heights)), dpi=110)
-    grid = figure.add_gridspec(len(heights), settings.columns, height_ratios=heights, hspace=0.06, wspace=0.04)
+    figure = plt.figure(figsize=(1.15 * columns + 1.4, 1.15 * sum(heights)), dpi=110)
+    grid = figure.add_gridspec(len(heights), columns, height_ratios=heights, hspace=0.06, wspace=0.04)
     for row in range(count):
         top = row * (lines + 2)
-        steps = torch.linspace(0, int(worlds.episodes["length"][row]), settings.columns).round().long()
+        steps = torch.linspace(0, int(worlds.episodes["length"][row]), columns).round().long()
         films = [
             (f"{world}\n{camera}" if len(cameras) > 1 else world, episodes.frames(camera, torch.tensor(row), steps))
             for world, episodes in (("physics", worlds.episodes), ("imagined", worlds.imagined))
@@ -82,8 +84,8 @@ def draw(worlds: TwoWorlds, tasks: tuple[str, ...], settings: Settings) -> None:
                     axes.set_ylabel(name, fontsize=8)
         task = tasks[int(worlds.episodes[keys.TASK_ID][row])].split("/")[-1].replace("_", " ")
         _curve(figure.add_subplot(grid[top + lines, :]), worlds, row, task, steps)
-    settings.out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(settings.out, bbox_inches="tight")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out, bbox_inches="tight")
     plt.close(figure)
 
 

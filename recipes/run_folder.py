@@ -63,11 +63,15 @@ class RunFolder:
             raise FileNotFoundError(f"{path} does not exist: run the stage {stage!r} on this folder first")
         return path
 
-    def open(self, config: Any) -> None:
-        """Creates the folder, or checks that the one found was made with the same settings.
+    def open(self, config: Any, tasks: dict[str, str] | None = None) -> None:
+        """Creates the folder, or checks that the one found was made with the same settings and tasks.
+
+        Args:
+            config: the settings, a dataclass.
+            tasks: digest of each task, by name.
 
         Raises:
-            ValueError: if ``config.yaml`` exists and differs, naming the first settings that do.
+            ValueError: if ``config.yaml`` exists and differs, naming the first settings that do, or a task has changed.
             OSError: if less than :data:`MIN_FREE_GB` is free on the disk.
         """
         new = _plain(dataclasses.asdict(config))
@@ -93,6 +97,19 @@ class RunFolder:
             (self.path / name).mkdir(exist_ok=True)
         _write_atomically(stored, yaml.safe_dump(new, sort_keys=False))
         self._note_versions()
+        self._note_tasks(tasks or {})
+
+    def _note_tasks(self, tasks: dict[str, str]) -> None:
+        """Notes the digests of the tasks in ``tasks.json``, once."""
+        path = self.path / "tasks.json"
+        noted = json.loads(path.read_text()) if path.exists() else {}
+        changed = [task for task, digest in tasks.items() if noted.get(task, digest) != digest]
+        if changed:
+            raise ValueError(
+                f"{changed[0]} has changed since {self.path} was made: use another --run-dir, or the file as it was"
+            )
+        if tasks and not noted:
+            _write_atomically(path, json.dumps(tasks, indent=1) + "\n")
 
     def _note_versions(self) -> None:
         """Adds what runs now to ``versions.json`` if it is not what ran last."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import FrameType
@@ -12,12 +13,14 @@ from typing import Any
 
 import torch
 import tyro
+from tqdm import tqdm
 
 from checks import check_config
 from config import PRESETS, WorldEnvConfig
 from parts import COMPACT, Parts
 from run import Run
 from run_folder import RunFolder
+from worldenv_trl.scenes import load_task
 
 Work = Callable[..., None]
 """``work(run, **options)``: what a stage does."""
@@ -89,8 +92,11 @@ def rerun(kind: str, work: Work, run: Run) -> None:
     if not same:
         raise SystemExit(f"these settings have no stage {kind!r}: {', '.join(stage.name for stage in stages)}")
     index = next((index for index in same if not _finished(stages[index], run.folder)), same[-1])
+    again = [later.name for later in stages[index + 1 :] if run.folder.done(later.name)]
     for later in stages[index + 1 :]:
         run.folder.forget(later.name)
+    if again:
+        print(f"{', '.join(again)} learned from what {stages[index].name} made before: to be run again")
     _run(stages[index], work, run)
 
 
@@ -104,7 +110,7 @@ def open_run(config: WorldEnvConfig, parts: Parts = COMPACT) -> Run:
     try:
         check_config(config)
         folder = RunFolder(config.run_dir)
-        folder.open(config)
+        folder.open(config, {task: load_task(task).digest for task in config.tasks})
     except (ValueError, OSError, RuntimeError) as error:
         raise SystemExit(f"error: {error}") from error
     torch.set_num_threads(config.num_threads)
@@ -126,8 +132,11 @@ def _run(stage: Stage, work: Work, run: Run) -> None:
     here = threading.current_thread() is threading.main_thread()
     before = signal.signal(signal.SIGINT, interrupt) if here else None
     try:
-        with run.folder.stage(stage.name):
+        with run.folder.stage(stage.name), warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_: tqdm.write(f"warning: {message}", file=sys.stderr)
             work(run, **stage.options)
+    except FileNotFoundError as error:
+        raise SystemExit(f"error: {error}") from error
     except BaseException as error:
         if not interrupted.is_set():
             raise

@@ -44,6 +44,10 @@ def run_all(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     folder = run.folder.path
     plot_run(folder)
     print(summary_table(folder))
+    print(
+        "Success in %, [95 % Wilson intervals], p of an exact McNemar test on the same initial states. "
+        "physics: the goal predicate ends an episode; reflector: nothing but the reflector does."
+    )
     episodes = max(min(config.evaluate.episodes_per_task // 5, report.Report.episodes_per_task), 1)
     settings = report.Report(folder, episodes_per_task=episodes, num_threads=config.num_threads)
     try:

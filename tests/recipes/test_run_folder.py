@@ -74,3 +74,11 @@ def test_versions_are_noted_once_and_again_when_they_change(config, monkeypatch)
         monkeypatch.setattr(run_folder, "machine_versions", lambda version=version: {"torch": version})
         RunFolder(config.run_dir).open(config)
     assert json.loads((config.run_dir / "versions.json").read_text()) == [{"torch": "2.13.0"}, {"torch": "2.14.0"}]
+
+
+def test_a_task_that_has_changed_since_is_named(tmp_path):
+    folder, config = RunFolder(tmp_path / "run"), PRESETS["smoke"][1]
+    folder.open(config, {"a.bddl": "1", "b.bddl": "2"})
+    folder.open(config, {"a.bddl": "1", "b.bddl": "2"})
+    with pytest.raises(ValueError, match="b.bddl has changed since .* was made: use another --run-dir"):
+        folder.open(config, {"a.bddl": "1", "b.bddl": "3"})

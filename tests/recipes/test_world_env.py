@@ -21,6 +21,7 @@ from world_env import run_all
 from worldenv_trl import keys
 from worldenv_trl.envs import context_id
 from worldenv_trl.record import read_rollouts
+from worldenv_trl.scenes.catalogue import SUITES_FOLDER
 
 
 def test_presets_parse_and_single_settings_are_overridden():
@@ -117,3 +118,18 @@ def test_an_interrupt_ends_with_one_line_even_if_a_library_turns_it_into_an_erro
         run_all(tiny)
     assert not RunFolder(tiny.run_dir).done("demonstrate")
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_one_task_under_two_names_is_refused(tiny, tmp_path):
+    text = (SUITES_FOLDER / "starter" / "open_the_top_drawer.bddl").read_text()
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.bddl").write_text(text + f"; {name}\n")
+    names = tuple(str(tmp_path / f"{name}.bddl") for name in ("one", "two"))
+    with pytest.raises(ValueError, match=r"names a task twice: .*one.bddl and .*two.bddl say the same"):
+        check_config(dataclasses.replace(tiny, tasks=names))
+
+
+def test_a_stage_without_its_input_names_the_stage_to_run(tiny):
+    run = open_run(tiny)
+    with pytest.raises(SystemExit, match="error: .*demonstrations.mcap does not exist: run the stage 'demonstrate'"):
+        rerun("sft", world_env.WORKS["sft"], run)

@@ -96,7 +96,7 @@ def imagined(model, steps):
     return ImaginedEnv(model, ForwardKinematics(), contexts, [2, 2], max_steps=steps, seed=3)
 
 
-def imagine(path, model, *, reflector=None, described=True, steps=16):
+def imagine(path, model, *, reflector=None, described=True, steps=16, parts=1):
     env = imagined(model, steps)
     models = {"world_model": model}
     if reflector is not None:
@@ -104,7 +104,8 @@ def imagine(path, model, *, reflector=None, described=True, steps=16):
     wave = next(iter(GroupCollector(env, closing(4), groups_per_batch=2)))
     about = provenance(env, models=models, tasks=[TASK]) if described else {}
     with RolloutWriter(path, **about) as writer:
-        writer.write(wave)
+        for part in wave.chunk(parts):
+            writer.write(part)
     return wave
 
 
@@ -192,9 +193,10 @@ def test_a_file_that_names_no_model_is_not_called_exact(tmp_path):
     assert report.exact is None and any("does not name its world_model" in note for note in report.notes)
 
 
-def test_a_model_that_depends_on_its_batch_is_replayed_with_the_rows_of_its_wave(tmp_path):
+@pytest.mark.parametrize("parts", [1, 2])
+def test_a_model_that_depends_on_its_batch_is_replayed_with_the_rows_of_its_wave(tmp_path, parts):
     model = Painter(together=True)
-    imagine(tmp_path / "a.mcap", model, reflector=Redness())
+    imagine(tmp_path / "a.mcap", model, reflector=Redness(), parts=parts)  # post-training writes group by group
     report = replay(tmp_path / "a.mcap", 2, world_model=model, write=False)
     assert report.exact is True
     assert any("with the 4 rows of its wave" in note for note in report.notes)

@@ -234,11 +234,13 @@ def _imagined(
 
 def _wave(source: Source) -> tuple[TensorDict, int, int] | None:
     """All rollouts that were imagined together with this one [R, D], its place among them, and the size of groups."""
-    batch = source.env.get("batch_size", [])
-    part = next((part for part in Recording(source.path).written if source.number in part.numbers), None)
+    batch, written = source.env.get("batch_size", []), Recording(source.path).written
+    part = next((part for part in written if source.number in part.numbers), None)
     if len(batch) != 2:
         return None
-    rows, numbers = batch[0] * batch[1], [] if part is None else part.numbers
+    rows, numbers = batch[0] * batch[1], [] if part is None else list(part.numbers)
+    if len(numbers) % rows:  # a wave may have been written in several parts, one after the other
+        numbers = [number for each in written for number in each.numbers]
     if part is None:  # a recorder's: the rows that began as often
         infos = [(info.row, info) for info in list_rollouts(source.path) if info.row is not None]
         episode = next((info.episode for _, info in infos if info.number == source.number), None)
