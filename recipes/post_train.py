@@ -122,6 +122,8 @@ def _write(run: Run, name: str, about: dict, wave: TensorDictBase, aside: Frames
             if frames is not None:
                 part["next"] = part["next"].clone(False).update(frames[group : group + 1].contiguous())
             writer.write(part)
+            if aside is not None:
+                aside.release()
 
 
 def _wave_metrics(wave: TensorDictBase, returns: torch.Tensor, tasks: tuple[str, ...]) -> dict[str, float]:

@@ -15,6 +15,7 @@ from worldenv_trl.objectives import LOOPLoss
 from worldenv_trl.row_texts import row_texts
 
 PATIENCE = 3  # iterations
+_PIXELS = 256 * 3 * 64 * 64  # whose activations fit into memory together
 STUCK = (
     "warning: {}, iteration {}: for {} iterations the first update alone has moved the policy by more than max_kl={}, "
     "so nearly nothing is learned: the scale of a dimension may be too small for how far its mean moves "
@@ -62,22 +63,36 @@ def update(
             batch = decisions[rows]
             # A minibatch stands for its share of the whole batch.
             batch["total_steps"] = (total_steps * len(rows) / len(decisions)).expand(len(rows), 1)
-            out = loss(batch)
-            if out["kl_approx"].item() > settings.max_kl:
+            optimizer.zero_grad()
+            figures = _backward(loss, batch)
+            if figures["kl_approx"] > settings.max_kl:
                 stopped = True
                 break
-            optimizer.zero_grad()
-            out["loss_objective"].backward()
             for parameters in parameter_groups:
                 torch.nn.utils.clip_grad_norm_(parameters, settings.max_grad_norm)
             optimizer.step()
             count += 1
-            for name, value in out.items():
-                if value.numel() == 1:
-                    sums[name] = sums.get(name, 0.0) + value.item()
+            for name, value in figures.items():
+                sums[name] = sums.get(name, 0.0) + value
         if stopped:
             break
     return {name: value / max(count, 1) for name, value in sums.items()} | {"updates": count, "kl_stop": float(stopped)}
+
+
+def _backward(loss: LOOPLoss, batch: TensorDictBase) -> dict[str, float]:
+    """Gradients and figures of a minibatch, as many rows at a time as 64 px images of one camera would be: the losses
+    of the parts add up to that of the whole."""
+    pixels = sum(value[0].numel() for value in batch["observation"].values() if value.dtype == torch.uint8)
+    steps, figures = batch[keys.STEP_MASK].sum(), dict[str, float]()
+    for part in batch.split(max(16, _PIXELS // max(pixels, 1))):
+        out = loss(part)
+        out["loss_objective"].backward()
+        share = (part[keys.STEP_MASK].sum() / steps).item()
+        for name, value in out.items():
+            if value.numel() == 1:
+                weight = 1.0 if name == "loss_objective" else share
+                figures[name] = figures.get(name, 0.0) + weight * value.item()
+    return figures
 
 
 def stuck(before: int, metrics: dict[str, float]) -> int:

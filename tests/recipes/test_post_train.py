@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 
 import probes
+import updates
 from config import PRESETS, PostTrain
 from physics import exploring_actor
 from run import Run
@@ -79,6 +80,27 @@ def test_an_iteration_without_an_informative_decision_moves_nothing():
     wave[keys.ADVANTAGE].zero_()
     assert update(wave, *last) == {"updates": 0, "kl_stop": 0.0}
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
+
+
+def test_a_minibatch_in_parts_gives_the_gradients_of_the_whole(monkeypatch):
+    torch.manual_seed(0)
+    policy = OFTPolicy(OFTConfig(instructions=("do it",), image_size=16, dim=32, depth=1))
+    actor = laplace_actor(policy)
+    loss = LOOPLoss(actor, functional=False)
+    with torch.no_grad():
+        batch = actor(decisions(40))
+    batch[keys.ADVANTAGE] = torch.randn(40, 1)
+    batch[keys.STEP_MASK] = torch.rand(40, 8) < 0.7
+    batch["total_steps"] = batch[keys.STEP_MASK].sum().expand(40, 1)
+    found = []
+    for most in (10**9, 1):
+        monkeypatch.setattr(updates, "_PIXELS", most)
+        policy.zero_grad()
+        figures = updates._backward(loss, batch.clone())
+        found.append((figures, [parameter.grad.clone() for parameter in policy.loc_head.parameters()]))
+    (whole, gradients), (parts, summed) = found
+    assert whole["loss_objective"] == pytest.approx(parts["loss_objective"], abs=1e-6)
+    assert all(torch.allclose(a, b, atol=1e-6) for a, b in zip(gradients, summed, strict=True))
 
 
 def test_the_scale_is_bounded_below_by_what_the_demonstrations_use_of_each_dimension():

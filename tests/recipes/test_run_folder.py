@@ -80,5 +80,5 @@ def test_a_task_that_has_changed_since_is_named(tmp_path):
     folder, config = RunFolder(tmp_path / "run"), PRESETS["smoke"][1]
     folder.open(config, {"a.bddl": "1", "b.bddl": "2"})
     folder.open(config, {"a.bddl": "1", "b.bddl": "2"})
-    with pytest.raises(ValueError, match="b.bddl has changed since .* was made: use another --run-dir"):
+    with pytest.raises(ValueError, match=r"b.bddl has changed since .* was made: use another --run-dir"):
         folder.open(config, {"a.bddl": "1", "b.bddl": "3"})

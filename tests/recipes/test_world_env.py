@@ -131,5 +131,5 @@ def test_one_task_under_two_names_is_refused(tiny, tmp_path):
 
 def test_a_stage_without_its_input_names_the_stage_to_run(tiny):
     run = open_run(tiny)
-    with pytest.raises(SystemExit, match="error: .*demonstrations.mcap does not exist: run the stage 'demonstrate'"):
+    with pytest.raises(SystemExit, match=r"error: .*demonstrations.mcap does not exist: run the stage 'demonstrate'"):
         rerun("sft", world_env.WORKS["sft"], run)

@@ -45,6 +45,11 @@ class FramesAside(Transform):
             raise RuntimeError("no frames were kept: set keep to True before the env is reset")
         return LazyStackedTensorDict.lazy_stack(self._decisions, self._decisions[0].ndim)
 
+    def release(self) -> None:
+        """Gives back the memory that shows the files."""
+        for decision in self._decisions:
+            release(decision)
+
     def _reset(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None or bool(mask.all()):
