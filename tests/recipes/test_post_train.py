@@ -7,6 +7,7 @@ import copy
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import probes
 import updates
@@ -48,8 +49,8 @@ def test_without_a_world_model_there_is_nothing_to_distrust(monkeypatch, tmp_pat
 def test_iterations_that_stop_after_their_first_update_are_counted_and_said():
     logged = [(1, 1.0), (18, 0.0), (1, 1.0), (0, 1.0), (1, 1.0), (1, 0.0)]
     counts, before = [], 0
-    for updates, kl_stop in logged:
-        before = stuck(before, {"updates": updates, "kl_stop": kl_stop})
+    for number, kl_stop in logged:
+        before = stuck(before, {"updates": number, "kl_stop": kl_stop})
         counts.append(before)
     assert counts == [1, 0, 1, 2, 3, 0]
     said = STUCK.format("post_train", 4, 3, 0.1)
@@ -87,7 +88,7 @@ def test_a_minibatch_in_parts_gives_the_gradients_of_the_whole(monkeypatch):
     policy = OFTPolicy(OFTConfig(instructions=("do it",), image_size=16, dim=32, depth=1))
     actor = laplace_actor(policy)
     loss = LOOPLoss(actor, functional=False)
-    with torch.no_grad():
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         batch = actor(decisions(40))
     batch[keys.ADVANTAGE] = torch.randn(40, 1)
     batch[keys.STEP_MASK] = torch.rand(40, 8) < 0.7
@@ -100,7 +101,8 @@ def test_a_minibatch_in_parts_gives_the_gradients_of_the_whole(monkeypatch):
         found.append((figures, [parameter.grad.clone() for parameter in policy.loc_head.parameters()]))
     (whole, gradients), (parts, summed) = found
     assert whole["loss_objective"] == pytest.approx(parts["loss_objective"], abs=1e-6)
-    assert all(torch.allclose(a, b, atol=1e-6) for a, b in zip(gradients, summed, strict=True))
+    together, added = (torch.cat([gradient.flatten() for gradient in each]) for each in (gradients, summed))
+    assert together.norm() > 0.1 and (together - added).norm() < 1e-4 * together.norm()
 
 
 def test_the_scale_is_bounded_below_by_what_the_demonstrations_use_of_each_dimension():
