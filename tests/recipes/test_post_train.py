@@ -70,7 +70,7 @@ def test_an_iteration_without_an_informative_decision_moves_nothing():
     actor = laplace_actor(policy)
     loss = LOOPLoss(actor, functional=False)
     optimizer = torch.optim.AdamW([parameter for group in groups.values() for parameter in group], lr=0.1)
-    with torch.no_grad():
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         wave = actor(decisions(6)).reshape(1, 2, 3)
     wave[keys.ADVANTAGE] = torch.tensor([1.0, -1.0]).view(1, 2, 1, 1).expand(1, 2, 3, 1).clone()
     wave["next", keys.STEP_MASK] = torch.ones(1, 2, 3, 8, dtype=torch.bool)
