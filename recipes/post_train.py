@@ -85,7 +85,7 @@ def post_train(run: Run, source: str, target: str, models: str) -> None:
         if stuck_for == PATIENCE:
             progress.write(STUCK.format(target, iteration, stuck_for, settings.max_kl))
         if about:
-            parts = wave.reshape(-1).split(settings.minibatch_size)
+            parts = wave.reshape(-1).split(64)
             wave.update(torch.cat([loss.ratios(part) for part in parts]).reshape(wave.shape))
             _write(run, f"{target}_{iteration:03d}", about, wave, aside)
         mean.update_parameters(policy)
