@@ -263,7 +263,7 @@ class ImaginedEnv(EnvBase):
         active = tensordict.get("_step", None)
         active = torch.ones_like(self._steps, dtype=torch.bool) if active is None else active.reshape(-1)
         rows = (active & (self._steps < self.max_steps)).nonzero().squeeze(-1)
-        out = self._observe()
+        out = self._observe(frames=len(rows) < len(active))
         if len(rows):
             if not bool(chunk[rows].isfinite().all()):
                 raise ValueError(f"the action chunk {CHUNK} holds NaN or infinity in an active row")
@@ -313,7 +313,10 @@ class ImaginedEnv(EnvBase):
             (NUM_STEPS, self._steps[rows].unsqueeze(-1)),
             (NOISE_SEED, seeds),
         ):
-            out[key].flatten(0, 1)[rows] = value  # a view: written in place
+            if count == self.batch_size.numel():
+                out[key] = value.unflatten(0, self.batch_size)
+            else:
+                out[key].flatten(0, 1)[rows] = value  # a view: written in place
         for camera, video in frames.items():
             self._image(camera)[rows] = video[last]
 
@@ -348,8 +351,9 @@ class ImaginedEnv(EnvBase):
         parts = (self._context[rows, 0], rows % self.batch_size[1], self._episode[rows], self._decisions[rows])
         return noise_seeds(self._seed, *parts).unsqueeze(-1)
 
-    def _observe(self) -> TensorDictBase:
-        """The current observation of all rows, with an empty chunk: what a reset, or a row not stepped, shows."""
+    def _observe(self, *, frames: bool = True) -> TensorDictBase:
+        """The current observation of all rows, with an empty chunk: what a reset, or a row not stepped, shows. Without
+        ``frames`` where those of all rows are about to be written."""
         batch, chunk, image = self.batch_size, self.chunk_length, (3, self.image_size, self.image_size)
         images = {image_entry(name): self._image(name).clone().unflatten(0, batch) for name in self.cameras}
         if self._text_stack is None:
@@ -365,7 +369,7 @@ class ImaginedEnv(EnvBase):
                 TASK_ID: self._task.clone().unflatten(0, batch),
                 CONTEXT_ID: self._context.clone().unflatten(0, batch),
                 NUM_STEPS: self._steps.clone().view(*batch, 1),
-                FRAMES: {image_entry(name): empty(*image, dtype=torch.uint8) for name in self.cameras},
+                FRAMES: {image_entry(name): empty(*image, dtype=torch.uint8) for name in self.cameras if frames},
                 STATES: empty(STATE_DIM),
                 KINEMATIC_STATES: empty(KINEMATIC_DIM),
                 NOISE_SEED: torch.zeros(*batch, 1, dtype=torch.int64, device=self.device),

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torchrl.data import Binary, Bounded, Composite, NonTensor, Unbounded
+from torchrl.data import Binary, Composite, NonTensor, Unbounded
 
 from worldenv_trl import keys
+from worldenv_trl.envs.pixels import Pixels
 
 __all__ = ["imagined_specs"]
 
@@ -26,8 +27,8 @@ def imagined_specs(
     """
     image = (3, image_size, image_size)
 
-    def pixels(*shape: int) -> Bounded:
-        return Bounded(0, 255, shape=(*batch, *shape), dtype=torch.uint8, device=device)
+    def pixels(*shape: int) -> Pixels:
+        return Pixels((*batch, *shape), device)
 
     def real(*shape: int) -> Unbounded:
         return Unbounded(shape=(*batch, *shape), device=device)

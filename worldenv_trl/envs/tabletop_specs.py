@@ -8,6 +8,7 @@ import torch
 from torchrl.data import Binary, Bounded, Composite, NonTensor, Unbounded
 
 from worldenv_trl import keys
+from worldenv_trl.envs.pixels import Pixels
 
 __all__ = ["tabletop_specs"]
 
@@ -37,9 +38,7 @@ def tabletop_specs(
     def nested(entries: dict) -> Composite:
         return Composite(entries, shape=batch, device=cpu)
 
-    pixels = {
-        name: Bounded(0, 255, shape=(*batch, *shape), dtype=torch.uint8, device=cpu) for name, shape in images.items()
-    }
+    pixels = {name: Pixels((*batch, *shape), cpu) for name, shape in images.items()}
     observation = {
         "observation": nested({**pixels, "state": real(keys.STATE_DIM)}),
         keys.KINEMATIC_STATE: real(keys.KINEMATIC_DIM),

@@ -34,6 +34,7 @@ from worldenv_trl.world_models.video_training import video_loss
 __all__ = ["VideoWorldModel", "VideoWorldModelConfig"]
 
 _MEMORY = 3  # first frame, the frame memory_stride back, last frame
+_PIXELS_AT_ONCE = 2**17  # of a frame, all rows and cameras: half of it and twice as many are slower at 128 px
 _POSITION_SCALE = 10.0  # metres to the unit scale of the network's other inputs
 
 
@@ -60,8 +61,9 @@ class VideoWorldModelConfig:
     precision: str = "auto"
     """``float32``, ``bfloat16`` (autocast) or ``auto``: bfloat16 where there is hardware for it (GPU, CPU with AMX). On
     a CPU without AMX bfloat16 convolutions take 1.8 times as long as float32 ones."""
-    rows_per_call: int = 16
-    """Rows that pass through the network at once at inference; keeps activations inside the CPU cache."""
+    rows_per_call: int | None = None
+    """Rows that pass through the network at once at inference; few enough keep the activations inside the CPU cache.
+    None is 16, or fewer of larger images."""
     unroll_prob: float = 0.5
     """In training, share of the later chunks of a window that remember the model's own frames."""
     noise_prob: float | None = None
@@ -93,6 +95,8 @@ class VideoWorldModelConfig:
             raise ValueError(f"precision must be auto, float32 or bfloat16, got {self.precision!r}")
         if not 1 <= self.num_denoise_steps <= 4:
             raise ValueError(f"num_denoise_steps must lie between 1 and 4, got {self.num_denoise_steps}")
+        if self.rows_per_call is not None and self.rows_per_call < 1:
+            raise ValueError(f"rows_per_call must be at least 1, got {self.rows_per_call}")
         if any(self.width * factor % 8 for factor in self.multipliers):
             raise ValueError(f"width times every multiplier must be a multiple of 8, got {self.width}")
         for name, value in (("unroll_prob", self.unroll_prob), ("noise_prob", self.noise_prob)):
@@ -111,6 +115,12 @@ class VideoWorldModelConfig:
             for name, by_instruction in cameras.items()
         }
         return cls(cameras=plain, **settings)
+
+    @property
+    def rows_at_once(self) -> int:
+        """:attr:`rows_per_call`, or what it is when that is None."""
+        pixels = self.image_size**2 * max(1, len(self.cameras))
+        return self.rows_per_call or min(16, max(1, _PIXELS_AT_ONCE // pixels))
 
     @property
     def instructions(self) -> tuple[str, ...]:
@@ -186,18 +196,17 @@ class VideoWorldModel(WorldModel, Pretrained):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._check(tensordict)
-        texts, rows = instructions_of(tensordict), self.config.rows_per_call
+        texts, rows = instructions_of(tensordict), self.config.rows_at_once
         self.seen.check(texts)
+        shape, device = (len(texts), self.chunk_length, 3, self.image_size, self.image_size), tensordict[POSES].device
+        frames = {camera: torch.empty(shape, dtype=torch.uint8, device=device) for camera in self.cameras}
         with torch.no_grad():
-            parts = [
-                self._generate(tensordict[start : start + rows], texts[start : start + rows])
-                for start in range(0, len(texts), rows)
-            ]
-        size, device = self.image_size, tensordict[POSES].device
-        empty = torch.zeros(0, len(self.cameras), self.chunk_length, 3, size, size, dtype=torch.uint8, device=device)
-        frames = torch.cat(parts) if parts else empty
-        for index, camera in enumerate(self.cameras):
-            tensordict.set(frames_key(camera), frames[:, index])
+            for start in range(0, len(texts), rows):
+                painted = self._generate(tensordict[start : start + rows], texts[start : start + rows])
+                for camera, video in zip(self.cameras, painted.unbind(1), strict=True):
+                    frames[camera][start : start + rows] = video
+        for camera, video in frames.items():
+            tensordict.set(frames_key(camera), video)
         return tensordict
 
     def _generate(self, tensordict: TensorDictBase, texts: Sequence[str]) -> Tensor:
