@@ -32,6 +32,11 @@ class SFT:
     """Random image shift, the augmentation that helps with five demonstrations."""
     dim: int = 128
     depth: int = 2
+    vision_blocks: tuple[int, ...] = ()
+    """Blocks of a frozen ImageNet encoder that the policy sees through, too, for instance 2 4 10; its weights come with
+    the extra ``vision``."""
+    vision_weights: Path | None = None
+    """The encoder's weights; those of the extra ``vision`` when None."""
     scale_steps: int = 200
     scale_lr: float = 1e-3
 
@@ -104,6 +109,7 @@ class PostTrain:
     ratio_level: str = "step"
     """``step`` (World-Env Eq. 5) or ``chunk``: one ratio for all steps of a chunk."""
     lora_rank: int = 16
+    """Of the adapters; at 0 the whole policy is updated instead, but for frozen encoders."""
     lora_lr: float = 2e-4
     head_lr: float = 2e-4
     averaging: float = 0.8

@@ -46,7 +46,7 @@ def instructions(config: WorldEnvConfig) -> tuple[str, ...]:
 
 def make_policy(config: WorldEnvConfig) -> OFTPolicy:
     settings = config.sft
-    return OFTPolicy(
+    policy = OFTPolicy(
         OFTConfig(
             instructions=instructions(config),
             cameras=config.cameras,
@@ -55,8 +55,12 @@ def make_policy(config: WorldEnvConfig) -> OFTPolicy:
             proprio=PROPRIO,
             dim=settings.dim,
             depth=settings.depth,
+            vision_blocks=settings.vision_blocks,
         )
     )
+    if settings.vision_blocks:
+        policy.load_vision(settings.vision_weights)
+    return policy
 
 
 def make_world_model(config: WorldEnvConfig) -> VideoWorldModel:

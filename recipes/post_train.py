@@ -52,9 +52,12 @@ def post_train(run: Run, source: str, target: str, models: str) -> None:
         group_size=settings.group_size,
     )
     loss = LOOPLoss(actor, clip_epsilon=settings.clip_epsilon, ratio_level=settings.ratio_level, functional=False)
-    rates = {"adapters": settings.lora_lr, "heads": settings.head_lr}
     optimizer = torch.optim.AdamW(
-        [{"params": parameters, "lr": rates[name]} for name, parameters in groups.items()], weight_decay=0.0
+        [
+            {"params": parameters, "lr": settings.head_lr if name == "heads" else settings.lora_lr}
+            for name, parameters in groups.items()
+        ],
+        weight_decay=0.0,
     )
     full_rates = [group["lr"] for group in optimizer.param_groups]
     # Single iterations are noisy: what is probed and saved is a running mean of the weights they reach.

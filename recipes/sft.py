@@ -31,7 +31,8 @@ def fine_tune(run: Run) -> None:
     policy = run.parts.policy.make(config)
     policy.fit_statistics(samples[keys.STATE], samples[keys.CHUNK])
     scale = list(policy.scale_parameters())
-    others = [parameter for parameter in policy.parameters() if all(parameter is not each for each in scale)]
+    learning = [parameter for parameter in policy.parameters() if parameter.requires_grad]
+    others = [parameter for parameter in learning if all(parameter is not each for each in scale)]
     loss = _behaviour_cloning(laplace_actor(policy), loss_function="l1")
     _train(loss, samples, others, settings.steps, settings.lr, run, "l1")
 
@@ -41,7 +42,6 @@ def fine_tune(run: Run) -> None:
         parameter.requires_grad_(True)
     loss = _behaviour_cloning(likelihood_actor(policy))
     _train(loss, samples, scale, settings.scale_steps, settings.scale_lr, run, "nll")
-    policy.requires_grad_(True)
     policy.save_pretrained(run.folder.checkpoint("sft"))
 
 

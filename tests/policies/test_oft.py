@@ -166,8 +166,21 @@ def test_what_is_asked_for_twice_is_the_same_and_another_rank_is_refused():
     assert {id(p) for p in policy.parameters() if p.requires_grad} == trained
     with pytest.raises(ValueError, match="has adapters of rank 2"):
         policy.post_training_parameters(4)
-    with pytest.raises(ValueError, match="rank must be at least 1"):
+    with pytest.raises(ValueError, match="has adapters of rank 2"):
         policy.post_training_parameters(0)
+    with pytest.raises(ValueError, match="rank must not be negative, got -1"):
+        policy.post_training_parameters(-1)
+
+
+def test_at_rank_0_the_whole_policy_is_updated_and_no_adapter_is_added():
+    policy = oft_policy()
+    before = {name: p.detach().clone() for name, p in policy.named_parameters()}
+    groups = policy.post_training_parameters(0)
+    assert list(groups) == ["backbone", "heads"]
+    assert {id(p) for group in groups.values() for p in group} == {id(p) for p in policy.parameters()}
+    train_a_little(policy, observed())
+    changed = {name for name, p in policy.named_parameters() if not torch.equal(p, before[name])}
+    assert changed == set(before)
 
 
 @pytest.mark.parametrize("rank", [0, 4])

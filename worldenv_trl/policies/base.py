@@ -102,8 +102,8 @@ class Policy(TensorDictModuleBase, abc.ABC):
         """Prepares for LOOP and returns the groups that it updates, ``adapters`` and ``heads``; the rest is frozen.
 
         Adapters of that rank are added where there are none yet, without changing what the policy does; again with the
-        same rank, it returns the same groups. ``adapters`` is empty for a policy that has none. Build losses and
-        optimisers after this call.
+        same rank, it returns the same groups. ``adapters`` is empty for a policy that has none. Rank 0 adds none and
+        gives, as ``backbone``, what the adapters would have adapted. Build losses and optimisers after this call.
 
         Raises:
             ValueError: if there are adapters of another rank.

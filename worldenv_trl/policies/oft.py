@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,7 @@ from worldenv_trl.keys import ACTION_DIM, CHUNK_LENGTH, STATE_DIM
 from worldenv_trl.language import Vocabulary
 from worldenv_trl.policies.base import Policy
 from worldenv_trl.pretrained import Pretrained
+from worldenv_trl.vision import PretrainedEncoder
 
 __all__ = ["OFTConfig", "OFTPolicy"]
 
@@ -31,6 +33,9 @@ class OFTConfig:
         proprio: what the state tells, ``commanded`` or ``measured``.
         stem_widths: channels of the stem's convolutions, at least two; the first two halve the image.
         num_keypoints: tokens of each image.
+        vision_blocks: blocks of a frozen :class:`~worldenv_trl.vision.PretrainedEncoder` whose features join the
+            stem's; none when empty. :meth:`OFTPolicy.load_vision` brings its weights.
+        vision_width: channels that these features become.
         dim, depth, num_heads, mlp_ratio: the transformer.
         head_dim, head_blocks: the two MLPResNet heads.
         log_scale_init: the log-scale before training.
@@ -50,6 +55,8 @@ class OFTConfig:
     proprio: str = "commanded"
     stem_widths: tuple[int, ...] = (32, 32, 48)
     num_keypoints: int = 24
+    vision_blocks: tuple[int, ...] = ()
+    vision_width: int = 32
     dim: int = 128
     depth: int = 2
     num_heads: int = 4
@@ -124,14 +131,22 @@ class _Keypoints(nn.Module):
     patches, which halves the cost.
     """
 
-    def __init__(self, config: OFTConfig):
+    def __init__(self, config: OFTConfig, vision_widths: Sequence[int]):
         super().__init__()
         widths = (3, *config.stem_widths)
+        extra = config.vision_width if vision_widths else 0
         self.stem = nn.ModuleList(
             # Two halvings, then full resolution: the finer the maps, the finer the positions.
-            nn.Conv2d(fan_in, fan_out, 5 if i == 0 else 3, stride=2 if i < 2 else 1, padding=2 if i == 0 else 1)
+            nn.Conv2d(
+                fan_in + (extra if i == len(widths) - 2 else 0),
+                fan_out,
+                5 if i == 0 else 3,
+                stride=2 if i < 2 else 1,
+                padding=2 if i == 0 else 1,
+            )
             for i, (fan_in, fan_out) in enumerate(itertools.pairwise(widths))
         )
+        self.vision = nn.ModuleList(nn.Conv2d(width, extra, 1) for width in vision_widths)
         self.film = nn.Linear(config.dim, 2 * widths[-1])
         nn.init.normal_(self.film.weight, std=0.1)
         nn.init.zeros_(self.film.bias)
@@ -144,11 +159,16 @@ class _Keypoints(nn.Module):
         self.content = nn.Linear(widths[-1], config.dim)
         self.slot = nn.Parameter(torch.randn(config.num_keypoints, config.dim) * 0.2)
 
-    def forward(self, image: Tensor, sentence: Tensor) -> tuple[Tensor, Tensor]:
-        """[B, 3, H, W], [B, dim] -> tokens [B, K, dim] and their positions [B, K, 2] in [-1, 1]."""
+    def forward(self, image: Tensor, pretrained: Sequence[Tensor], sentence: Tensor) -> tuple[Tensor, Tensor]:
+        """[B, 3, H, W], maps [B, w, h', w'], [B, dim] -> tokens [B, K, dim], their positions [B, K, 2] in [-1, 1]."""
         features = image
         for conv in self.stem[:-1]:
             features = F.relu(conv(features))
+        if pretrained:
+            size = features.shape[-2:]
+            narrowed = (conv(maps) for conv, maps in zip(self.vision, pretrained, strict=True))
+            resized = [F.interpolate(maps, size, mode="bilinear", align_corners=False) for maps in narrowed]
+            features = torch.cat([features, F.relu(torch.stack(resized).sum(0))], 1)
         gain, bias = self.film(sentence)[:, :, None, None].chunk(2, 1)
         features = F.relu(self.stem[-1](features) * (1 + gain) + bias)
         attention = (self.maps(features).flatten(2) * self.log_sharpness.exp()).softmax(-1)  # [B, K, P]
@@ -166,7 +186,9 @@ class _Backbone(nn.Module):
         self.words = nn.Embedding(len(config.vocabulary), config.dim, padding_idx=0)
         nn.init.normal_(self.words.weight, std=0.3)
         self.word_position = nn.Parameter(torch.randn(config.max_words, config.dim) * 0.02)
-        self.keypoints = nn.ModuleList(_Keypoints(config) for _ in config.cameras)
+        self.vision = PretrainedEncoder(config.vision_blocks) if config.vision_blocks else None
+        widths = () if self.vision is None else self.vision.widths
+        self.keypoints = nn.ModuleList(_Keypoints(config, widths) for _ in config.cameras)
         self.proprio_in = nn.Linear(STATE_DIM, config.dim)
         self.proprio_out = nn.Linear(config.dim, config.dim)
         self.queries = nn.Parameter(torch.randn(config.chunk_length, config.dim) * 0.2)
@@ -177,11 +199,14 @@ class _Backbone(nn.Module):
         self.norm = nn.LayerNorm(config.dim)
 
     def forward(self, images: Sequence[Tensor], state: Tensor, words: Tensor) -> Tensor:
-        """Images of each camera, float [B, 3, H, W], state [B, 7], words int [B, L] -> [B, C, dim]."""
+        """Images of each camera, uint8 [B, 3, H, W], state [B, 7], words int [B, L] -> [B, C, dim]."""
         padded = words == 0
         text = self.words(words) * ~padded[..., None]  # [B, L, dim]
         sentence = text.sum(1) / (~padded).sum(1, keepdim=True).clamp(min=1)
-        seen = [keypoints(image, sentence) for keypoints, image in zip(self.keypoints, images, strict=True)]
+        seen = [
+            keypoints(image.float() / 127.5 - 1, self.vision(image) if self.vision is not None else (), sentence)
+            for keypoints, image in zip(self.keypoints, images, strict=True)
+        ]
         patches, positions = zip(*seen, strict=True)
         proprio = self.proprio_out(F.gelu(self.proprio_in(state)))[:, None]
         readout = self.readout(torch.cat([*(where.flatten(1) for where in positions), state], -1))
@@ -267,8 +292,8 @@ class OFTPolicy(Policy, Pretrained):
         self, images: Mapping[str, Tensor], state: Tensor, instructions: Sequence[str]
     ) -> tuple[Tensor, Tensor]:
         words = self._words(instructions)
-        pixels = [images[camera].float() / 127.5 - 1 for camera in self.cameras]
-        hidden = self.backbone(pixels, (state - self.state_center) / self.state_half_range, words)  # [n, C, dim]
+        seen = [images[camera] for camera in self.cameras]
+        hidden = self.backbone(seen, (state - self.state_center) / self.state_half_range, words)  # [n, C, dim]
         return self.loc_head(hidden) * self.action_range + self.action_center, self.scale_head(hidden)
 
     @torch.compiler.disable  # see Policy._goals
@@ -297,22 +322,37 @@ class OFTPolicy(Policy, Pretrained):
             center.copy_((low + high) / 2)
             half_range.copy_(((high - low) / 2).clamp(min=floor))
 
+    def load_vision(self, weights: str | os.PathLike | None = None) -> None:
+        """Gives the frozen encoder its ImageNet weights: :meth:`~worldenv_trl.vision.PretrainedEncoder.load_published`.
+
+        Raises:
+            ValueError: for a policy without ``vision_blocks``.
+        """
+        if self.backbone.vision is None:
+            raise ValueError(
+                "this policy has no pretrained encoder: build it with vision_blocks, for instance (2, 4, 10)"
+            )
+        self.backbone.vision.load_published(weights)
+
     def scale_parameters(self) -> list[nn.Parameter]:
         return list(self.scale_head.parameters())
 
     def post_training_parameters(self, rank: int) -> dict[str, list[nn.Parameter]]:
-        """Low-rank adapters (peft) on the backbone's linear layers, and both heads."""
-        if rank < 1:
-            raise ValueError(f"rank must be at least 1, got {rank}")
+        """Low-rank adapters (peft) on the backbone's linear layers, and both heads; at rank 0 the backbone itself, but
+        for the pretrained encoder, instead of adapters."""
+        if rank < 0:
+            raise ValueError(f"rank must not be negative, got {rank}")
         if self.config.lora_rank not in (0, rank):
             raise ValueError(f"this policy has adapters of rank {self.config.lora_rank}: it cannot get some of {rank}")
-        if not self.config.lora_rank:
+        if rank and not self.config.lora_rank:
             self.config = dataclasses.replace(self.config, lora_rank=rank)
             self._inject_adapters()
-        groups = {
-            "adapters": [parameter for name, parameter in self.backbone.named_parameters() if "lora_" in name],
-            "heads": [*self.loc_head.parameters(), *self.scale_head.parameters()],
-        }
+        named = list(self.backbone.named_parameters())
+        groups = {"heads": [*self.loc_head.parameters(), *self.scale_head.parameters()]}
+        if rank:
+            groups = {"adapters": [each for name, each in named if "lora_" in name]} | groups
+        else:
+            groups = {"backbone": [each for name, each in named if not name.startswith("vision.")]} | groups
         self.requires_grad_(False)
         for parameter in itertools.chain(*groups.values()):
             parameter.requires_grad_(True)
