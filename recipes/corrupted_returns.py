@@ -14,8 +14,10 @@ seen of it, within the context:
     r^2 = p (1 - b) / (p + (1 - p) b).
 
 p is the share of a group that succeeds; a group whose N rollouts all end alike counts as one of half a rollout in N, so
-that it can deceive, as it does in imagination. The correlations are those of endless groups; what came out in groups of
-N is measured by :func:`~worldenv_trl.metrics.advantage_correlation`.
+that it can deceive, as it does in imagination. The b of ``optimism`` at a given r is that of the task's rate in the
+wave, one for all its contexts. All this holds for endless groups: in groups of 8
+:func:`~worldenv_trl.metrics.advantage_correlation`, by which r is measured elsewhere, is .03 higher for noise and, as
+groups that look successful throughout count as 0, .03 to .1 lower for optimism. Compare what was measured.
 """
 
 from __future__ import annotations

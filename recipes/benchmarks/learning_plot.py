@@ -101,7 +101,10 @@ def draw(variants: dict[str, list[Curve]], out: Path) -> None:
         axes.set_title(f"{mode} success, {split} states", fontsize=10)
         axes.grid(alpha=0.3)
         if positive:
-            axes.set_xscale("symlog", linthresh=min(positive))
+            axes.set_xscale("symlog", linthresh=min(positive), linscale=0.3)
+            doubled = [min(positive) * 2**k for k in range(12) if 2**k <= max(positive) / min(positive)]
+            axes.set_xticks([0, *doubled], [f"{tick:,}" for tick in (0, *doubled)], fontsize=8, rotation=30)
+            axes.minorticks_off()
     for axes in grid[-1]:
         axes.set_xlabel("real rollouts")
     grid[0, 0].legend(fontsize=8, title="variant (seeds)", title_fontsize=8)
