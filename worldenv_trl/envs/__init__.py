@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from worldenv_trl.context_ids import context_id
     from worldenv_trl.envs.chunking import ChunkedActions, chunked
+    from worldenv_trl.envs.context_sampler import ContextSampler
     from worldenv_trl.envs.expert import ExpertPolicy
     from worldenv_trl.envs.frames_aside import FramesAside
     from worldenv_trl.envs.imagined import ImaginedEnv
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ChunkedActions",
+    "ContextSampler",
     "ExpertPolicy",
     "FramesAside",
     "ImaginedEnv",
@@ -32,6 +34,7 @@ __all__ = [
 
 _HOMES = {
     "ChunkedActions": "worldenv_trl.envs.chunking",
+    "ContextSampler": "worldenv_trl.envs.context_sampler",
     "ExpertPolicy": "worldenv_trl.envs.expert",
     "FramesAside": "worldenv_trl.envs.frames_aside",
     "ImaginedEnv": "worldenv_trl.envs.imagined",
