@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 
+from worldenv_trl.envs.context_sampler import ContextSampler, check_numbered
 from worldenv_trl.keys import (
     CONTEXT_ID,
     INSTRUCTION,
@@ -19,7 +20,7 @@ from worldenv_trl.keys import (
 )
 from worldenv_trl.kinematics import ForwardKinematics
 
-__all__ = ["check_contexts", "context_keys"]
+__all__ = ["ContextOrder", "check_contexts", "context_keys"]
 
 
 def context_keys(cameras: Sequence[str]) -> list[str | tuple[str, str]]:
@@ -53,6 +54,66 @@ def check_contexts(
         if tuple(contexts[key].shape) != (count, width):
             raise ValueError(f"the contexts' {key} must be {(count, width)}, got {tuple(contexts[key].shape)}")
     _check_state(contexts, kinematics)
+
+
+class ContextOrder:
+    """Which context each group starts from, the tasks in turn.
+
+    Args:
+        contexts: TensorDict [K] with their task ids and context ids.
+        sampler: draws the contexts of each task; without one they come in shuffled passes.
+
+    Raises:
+        ValueError: if a sampler is to draw contexts without numbers.
+    """
+
+    def __init__(self, contexts: TensorDictBase, sampler: ContextSampler | None) -> None:
+        self.sampler = sampler
+        self._tasks, self._ids = contexts[TASK_ID].flatten().tolist(), contexts[CONTEXT_ID].flatten().tolist()
+        if sampler is not None:
+            check_numbered(self._ids)
+        self.seed(0)
+
+    def seed(self, seed: int) -> None:
+        self._generator = torch.Generator().manual_seed(seed)
+        self._queue: list[int] = []
+        self._turn = 0  # of the tasks, for a sampler
+        if self.sampler is not None:
+            self.sampler.seed(seed)
+
+    def draw(self, count: int) -> list[int]:
+        """Places in the contexts [K] of the next ``count`` groups: no context twice in a draw if it can be."""
+        return self._shuffled(count) if self.sampler is None else self._sampled(count, self.sampler)
+
+    def _sampled(self, count: int, sampler: ContextSampler) -> list[int]:
+        tasks = sorted(set(self._tasks))
+        turns = [tasks[(self._turn + group) % len(tasks)] for group in range(count)]
+        self._turn = (self._turn + count) % len(tasks)
+        drawn = {}
+        for task in sorted(set(turns)):
+            places = [place for place, other in enumerate(self._tasks) if other == task]
+            chosen = sampler.draw([self._ids[place] for place in places], turns.count(task))
+            drawn[task] = iter([places[index] for index in chosen])
+        return [next(drawn[task]) for task in turns]
+
+    def _shuffled(self, count: int) -> list[int]:
+        drawn: list[int] = []
+        while len(drawn) < count:
+            if not self._queue:
+                order = self._order()
+                self._queue = [i for i in order if i not in drawn] + [i for i in order if i in drawn]
+            drawn.append(self._queue.pop(0))
+        return drawn
+
+    def _order(self) -> list[int]:
+        """All contexts, shuffled within their task, the tasks taking turns."""
+        shuffled = torch.randperm(len(self._tasks), generator=self._generator).tolist()
+        turn: dict[int, int] = {}
+        turns = []
+        for index in shuffled:
+            turns.append(turn.get(self._tasks[index], 0))
+            turn[self._tasks[index]] = turns[-1] + 1
+        return [index for _, index in sorted(zip(turns, shuffled, strict=True), key=lambda pair: pair[0])]
 
 
 def _check_state(contexts: TensorDictBase, kinematics: ForwardKinematics) -> None:

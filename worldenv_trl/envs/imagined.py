@@ -9,7 +9,8 @@ from tensordict import NonTensorStack, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from worldenv_trl.envs.contexts import check_contexts, context_keys
+from worldenv_trl.envs.context_sampler import ContextSampler
+from worldenv_trl.envs.contexts import ContextOrder, check_contexts, context_keys
 from worldenv_trl.envs.imagined_specs import imagined_specs
 from worldenv_trl.envs.noise_seeds import noise_seeds
 from worldenv_trl.keys import (
@@ -65,6 +66,7 @@ class ImaginedEnv(EnvBase):
             ``"measured"`` the pose of the predicted joints.
         seed: of the contexts' order and of the noise; drawn from torch's generator when None.
         device: of the specs and buffers; the contexts' when None.
+        context_sampler: draws the contexts of each task by how mixed their groups were, instead of in shuffled passes.
 
     A reset of a whole group draws its next context, the tasks in turn and without replacement while that is possible;
     rows reset while others of their group are running restart their context, so that a group never mixes contexts.
@@ -97,6 +99,7 @@ class ImaginedEnv(EnvBase):
         proprio: str = "commanded",
         seed: int | None = None,
         device: torch.device | str | None = None,
+        context_sampler: ContextSampler | None = None,
     ) -> None:
         batch = torch.Size(batch_size)
         if len(batch) != 2 or min(batch) < 1:
@@ -114,6 +117,7 @@ class ImaginedEnv(EnvBase):
         self.max_steps, self.chunk_length, self.proprio = int(max_steps), world_model.chunk_length, proprio
         self._contexts = contexts.select(*context_keys(self.cameras)).to(device).contiguous()
         self._instructions = instructions_of(contexts)
+        self.context_sampler, self._order = context_sampler, ContextOrder(contexts, context_sampler)
         specs = imagined_specs(batch, self.cameras, self.image_size, self.chunk_length, self._instructions[0], device)
         self.observation_spec, self.state_spec, self.action_spec, self.reward_spec, self.done_spec = specs
         self._make_buffers()
@@ -165,32 +169,10 @@ class ImaginedEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = int(torch.randint(2**31, ()).item()) if seed is None else int(seed)
-        self._generator = torch.Generator().manual_seed(self._seed)
-        self._queue: list[int] = []
+        self._order.seed(self._seed)
         self._resets.zero_()
 
     # ------------------------------------------------------------------------------------------------- reset
-
-    def _draw(self, count: int) -> list[int]:
-        """The next ``count`` contexts, the tasks in turn: no context twice in a draw if it can be."""
-        drawn: list[int] = []
-        while len(drawn) < count:
-            if not self._queue:
-                order = self._order()
-                self._queue = [i for i in order if i not in drawn] + [i for i in order if i in drawn]
-            drawn.append(self._queue.pop(0))
-        return drawn
-
-    def _order(self) -> list[int]:
-        """All contexts, shuffled within their task, the tasks taking turns."""
-        shuffled = torch.randperm(len(self._contexts), generator=self._generator).tolist()
-        tasks = self._contexts[TASK_ID].flatten().tolist()
-        turn: dict[int, int] = {}
-        turns = []
-        for index in shuffled:
-            turns.append(turn.get(tasks[index], 0))
-            turn[tasks[index]] = turns[-1] + 1
-        return [index for _, index in sorted(zip(turns, shuffled, strict=True), key=lambda pair: pair[0])]
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
         groups, rollouts = self.batch_size
@@ -208,7 +190,7 @@ class ImaginedEnv(EnvBase):
             self._load(rows, *self._given(tensordict, rows))
             self._episode[rows] = 0
         else:
-            drawn = self._draw(len(whole))
+            drawn = self._order.draw(len(whole))
             index = torch.tensor(drawn, dtype=torch.int64).repeat_interleave(rollouts)
             fresh = torch.tensor(whole, dtype=torch.int64)[:, None] * rollouts + torch.arange(rollouts)
             text = [self._instructions[i] for i in index.tolist()]

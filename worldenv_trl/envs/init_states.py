@@ -10,6 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from worldenv_trl.context_ids import UNKNOWN_CONTEXT, context_id, parts_of
+from worldenv_trl.envs.context_sampler import ContextSampler, check_numbered
 from worldenv_trl.scenes import Task
 
 __all__ = ["MODES", "InitStates"]
@@ -32,11 +33,12 @@ class InitStates:
         init_state_id: see ``mode``.
         states: ``[K, S]`` states to use instead of the split's.
         context_ids: ``[K]`` their numbers; unknown ones are -1.
+        sampler: draws the states instead, by how mixed the groups were that started from them; ``random`` only.
 
     Raises:
         TypeError: for states or numbers that are none.
         ValueError: for an unknown mode, an index out of range, states of another task's length or that hold NaN or
-            infinity, and numbers that do not match the states or name two of them.
+            infinity, and numbers that do not match the states or name two of them, or that a sampler cannot do without.
     """
 
     def __init__(
@@ -50,6 +52,7 @@ class InitStates:
         init_state_id: int = 0,
         states: np.ndarray | Tensor | None = None,
         context_ids: Sequence[int] | None = None,
+        sampler: ContextSampler | None = None,
     ) -> None:
         if mode not in MODES:
             raise ValueError(f"init_state_mode must be 'random', 'cycle' or 'fixed', got {mode!r}")
@@ -64,7 +67,11 @@ class InitStates:
             self.context_ids = unknown if context_ids is None else _numbers(context_ids, self.states)
         if not 0 <= init_state_id < len(self.states):
             raise ValueError(f"init_state_id must be in [0, {len(self.states)}), got {init_state_id}")
-        self.task, self.mode = task, mode
+        if sampler is not None:
+            if mode != "random":
+                raise ValueError(f"a context sampler draws at random: init_state_mode must be 'random', got {mode!r}")
+            check_numbered(self.context_ids)
+        self.task, self.mode, self.sampler = task, mode, sampler
         self.task_id, self.init_state_id = task_id, init_state_id
         # Of the order alone: a function of the task's name, not of its number in the run at hand.
         self._identity = int.from_bytes(hashlib.sha256(task.name.encode()).digest()[:8], "big")
@@ -73,20 +80,38 @@ class InitStates:
     def seed(self, seed: int) -> None:
         self._seed = seed
         self._orders: dict[int, np.ndarray] = {}  # of each pass over the states
+        self._sampled: dict[int, int] = {}  # the state of each episode that a sampler drew
+        if self.sampler is not None:
+            self.sampler.seed(seed)
 
     def draw(self, number: int) -> tuple[int, np.ndarray]:
-        """Context id and state ``[S]`` of the task's ``number``-th episode: a function of seed and number only."""
+        """Context id and state ``[S]`` of the task's ``number``-th episode: a function of seed and number only, but for
+        a sampler, which draws an episode's state once, when it is first asked for."""
+        numbers, states = self.draw_together([number])
+        return numbers[0], states[0]
+
+    def draw_together(self, numbers: Sequence[int]) -> tuple[list[int], np.ndarray]:
+        """Context ids and states ``[n, S]`` of episodes that begin together: a sampler draws no state twice for them if
+        it can be. Equal numbers are one episode's."""
+        if self.sampler is not None:
+            new = sorted(set(numbers) - self._sampled.keys())
+            self._sampled.update(zip(new, self.sampler.draw(self.context_ids, len(new)), strict=True))
+        places = [self._place(number) for number in numbers]
+        return [self.context_ids[place] for place in places], self.states[places]
+
+    def _place(self, number: int) -> int:
+        """Of the ``number``-th episode's state."""
+        if self.sampler is not None:
+            return self._sampled[number]
         count = len(self.states)
         if self.mode == "fixed":
-            index = self.init_state_id
-        elif self.mode == "cycle":
-            index = (self.init_state_id + number) % count
-        else:
-            epoch, place = divmod(number, count)
-            if epoch not in self._orders:
-                self._orders[epoch] = np.random.default_rng([self._seed, self._identity, epoch]).permutation(count)
-            index = self._orders[epoch][place]
-        return self.context_ids[index], self.states[index]
+            return self.init_state_id
+        if self.mode == "cycle":
+            return (self.init_state_id + number) % count
+        epoch, place = divmod(number, count)
+        if epoch not in self._orders:
+            self._orders[epoch] = np.random.default_rng([self._seed, self._identity, epoch]).permutation(count)
+        return int(self._orders[epoch][place])
 
     def find(self, number: int) -> np.ndarray:
         """The state ``[S]`` named by a context id, in this env's states or in either split of the task.

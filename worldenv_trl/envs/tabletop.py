@@ -15,6 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from worldenv_trl.context_ids import UNKNOWN_CONTEXT
+from worldenv_trl.envs.context_sampler import ContextSampler
 from worldenv_trl.envs.init_states import InitStates
 from worldenv_trl.envs.tabletop_arguments import (
     check_cameras,
@@ -82,6 +83,8 @@ class TabletopEnv(EnvBase):
         init_state_id: the fixed state, or where the cycle starts.
         init_state_count: how many states of the split take part, at most 50,000; 50 is the standard protocol.
         init_states: float64 [K, S] to use instead of the split's (one task only), with their ``context_ids`` [K].
+        context_sampler: draws the states of each task by how mixed the groups that started from them were, in place of
+            the shuffled passes of ``random``; episodes then follow from what it was told, too.
         group_repeats: that many consecutive rows share one initial state (the rollouts of an RLOO group).
         terminate_on_success: end a row when its goal holds; reward is 1 on that step, else 0. When False, a row runs to
             ``max_steps`` and reward is the success of each step.
@@ -129,6 +132,7 @@ class TabletopEnv(EnvBase):
         init_state_count: int = 50,
         init_states: np.ndarray | torch.Tensor | None = None,
         context_ids: Sequence[int] | None = None,
+        context_sampler: ContextSampler | None = None,
         group_repeats: int = 1,
         terminate_on_success: bool = True,
         max_steps: int | None = None,
@@ -149,7 +153,7 @@ class TabletopEnv(EnvBase):
         check_cameras(cameras, tasks)
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_envs]))
         self.tasks, self.task_ids = tuple(tasks), numbers
-        self.cameras, self.image_size = tuple(cameras), image_size
+        self.cameras, self.image_size, self.context_sampler = tuple(cameras), image_size, context_sampler
         self.terminate_on_success, self.proprio, self.with_sim_state = terminate_on_success, proprio, with_sim_state
         starts = [
             InitStates(
@@ -161,6 +165,7 @@ class TabletopEnv(EnvBase):
                 init_state_id=init_state_id,
                 states=init_states,
                 context_ids=context_ids,
+                sampler=context_sampler,
             )
             for item, number in zip(tasks, numbers, strict=True)
         ]
@@ -258,8 +263,7 @@ class TabletopEnv(EnvBase):
     def _drawn(self, block: _Block, local: np.ndarray) -> tuple[list[int], np.ndarray]:
         """The next initial states of a task's rows."""
         order = self._episode[block.rows[local]] * block.num_groups + block.groups[local]
-        numbers, states = zip(*(block.starts.draw(int(number)) for number in order), strict=True)
-        return list(numbers), np.stack(states)
+        return block.starts.draw_together(order.tolist())
 
     def _given(
         self, tensordict: TensorDictBase | None, block: _Block, rows: np.ndarray
