@@ -103,6 +103,9 @@ class PostTrain:
     iterations: int = 24
     groups: int = 24
     group_size: int = 8
+    contexts: str = "uniform"
+    """``uniform`` (each context as often as any other of its task) or ``mixed`` (more often where the returns of a
+    group are expected to differ: groups that all succeed or all fail teach nothing)."""
     epochs: int = 4
     minibatch_size: int = 256
     clip_epsilon: float = 0.1

@@ -14,7 +14,7 @@ from episodes import demonstrations_and_exploration
 from parts import PROPRIO
 from run import Run
 from worldenv_trl import keys
-from worldenv_trl.envs import FramesAside, ImaginedEnv, Reflect
+from worldenv_trl.envs import ContextSampler, FramesAside, ImaginedEnv, Reflect
 from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.row_texts import row_texts
 from worldenv_trl.world_models import WorldModel
@@ -36,7 +36,14 @@ class Imagination:
         contexts = read_contexts(run, world_model.cameras, rounds=int(suffix.removeprefix("_") or 1))
         return cls(world_model, run.reflector(suffix), run.rules(suffix)["imagined"], contexts)
 
-    def env(self, run: Run, batch_size: Sequence[int], contexts: TensorDict | None = None) -> TransformedEnv:
+    def env(
+        self,
+        run: Run,
+        batch_size: Sequence[int],
+        contexts: TensorDict | None = None,
+        *,
+        sampler: ContextSampler | None = None,
+    ) -> TransformedEnv:
         """FK, action map, world model; the reflector gives the reward and stops; frames are not carried along."""
         env = ImaginedEnv(
             self.world_model,
@@ -46,6 +53,7 @@ class Imagination:
             max_steps=run.config.max_steps,
             proprio=PROPRIO,
             seed=run.config.seed,
+            context_sampler=sampler,
         )
         return TransformedEnv(env, Compose(Reflect(self.reflector, self.rule), FramesAside()))
 

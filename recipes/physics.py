@@ -11,7 +11,7 @@ from torchrl.modules import MultiStepActorWrapper
 
 from config import WorldEnvConfig
 from parts import PROPRIO
-from worldenv_trl.envs import TabletopEnv, chunked
+from worldenv_trl.envs import ContextSampler, TabletopEnv, chunked
 from worldenv_trl.policies import LaplaceActor, Policy, laplace_actor, scale_bounds
 from worldenv_trl.record import provenance
 
@@ -43,12 +43,12 @@ def step_env(
     return TransformedEnv(tabletop(config, split, num_envs, tasks, **options), InitTracker())
 
 
-def physics_waves_env(config: WorldEnvConfig, groups: int, group_size: int) -> EnvBase:
+def physics_waves_env(
+    config: WorldEnvConfig, groups: int, group_size: int, *, sampler: ContextSampler | None = None
+) -> EnvBase:
     """Physics, one chunk a step, rows in groups that share an initial state: LOOP's upper bound."""
-    return chunked(
-        tabletop(config, "train", groups * group_size, None, group_repeats=group_size, with_sim_state=True),
-        config.chunk_length,
-    )
+    options = {"group_repeats": group_size, "with_sim_state": True, "context_sampler": sampler}
+    return chunked(tabletop(config, "train", groups * group_size, None, **options), config.chunk_length)
 
 
 def chunk_player(actor: LaplaceActor, chunk_length: int) -> MultiStepActorWrapper:

@@ -23,7 +23,7 @@ from stages import run_alone
 from updates import PATIENCE, STUCK, rate_factor, stuck, update
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
-from worldenv_trl.envs import FramesAside
+from worldenv_trl.envs import ContextSampler, FramesAside
 from worldenv_trl.metrics import HonestyAlarm
 from worldenv_trl.objectives import LOOPLoss, rloo_advantage
 from worldenv_trl.policies import Policy, laplace_actor
@@ -57,13 +57,14 @@ def post_train(
     groups = policy.post_training_parameters(settings.lora_rank)
     actor = exploring_actor(config, policy, settings.scale_factor)
 
+    sampler = ContextSampler() if settings.contexts == "mixed" else None
     shape = [settings.groups, settings.group_size]
     if settings.env == "imagined":
         imagination = Imagination.load(run, models)
-        env = imagination.env(run, shape)
+        env = imagination.env(run, shape, sampler=sampler)
         judges = {"world_model": imagination.world_model, "reflector": imagination.reflector}
     else:
-        imagination, env, judges = None, physics_waves_env(config, *shape), {}
+        imagination, env, judges = None, physics_waves_env(config, *shape, sampler=sampler), {}
     collector = GroupCollector(
         env,
         actor,
@@ -98,6 +99,8 @@ def post_train(
         for group, rate in zip(optimizer.param_groups, full_rates, strict=True):
             group["lr"] = factor * rate
         returns = returns_of(wave)  # [G, N]
+        if sampler is not None:
+            sampler.update(wave[keys.CONTEXT_ID][:, 0, 0, 0], returns)
         advantage = rloo_advantage(returns)
         if settings.standardize:
             advantage = advantage / advantage.std().clamp_min(1e-6)
@@ -117,6 +120,8 @@ def post_train(
         collector.update_policy_weights_()
 
         metrics |= _wave_metrics(wave, returns, config.tasks)
+        if sampler is not None:
+            metrics["contexts_seen"] = len(sampler)
         metrics["iteration_seconds"], started = time.monotonic() - started, time.monotonic()
         if iteration in probed:
             metrics |= probe(run, mean_actor, imagination, alarm)

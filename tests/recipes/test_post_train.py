@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 
 import pytest
 import torch
@@ -12,11 +13,15 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import probes
 import updates
 from config import PRESETS, PostTrain
+from parts import COMPACT
 from physics import exploring_actor
+from post_train import post_train
 from run import Run
 from run_folder import RunFolder
+from stages import open_run
 from updates import STUCK, stuck, update
 from worldenv_trl import keys
+from worldenv_trl.envs import ContextSampler
 from worldenv_trl.metrics import HonestyAlarm
 from worldenv_trl.objectives import LOOPLoss
 from worldenv_trl.policies import OFTConfig, OFTPolicy, laplace_actor
@@ -44,6 +49,47 @@ def test_without_a_world_model_there_is_nothing_to_distrust(monkeypatch, tmp_pat
     monkeypatch.setattr(probes, "physics_outcomes", lambda *_, **__: torch.tensor([True, False]))
     logged = probes.probe(Run(PRESETS["smoke"][1], RunFolder(tmp_path)), None, None, None)
     assert logged == {"real_success": 0.5, "probe_episodes": 6}
+
+
+@pytest.fixture
+def physics(tiny):
+    """A run of LOOP in the physics, two groups of two an iteration, from an untrained policy."""
+    learned = dataclasses.replace(tiny.post_train, iterations=4, env="tabletop", probe_every=0)
+    run = open_run(dataclasses.replace(tiny, post_train=learned))
+    torch.manual_seed(0)
+    COMPACT.policy.make(run.config).save_pretrained(run.folder.checkpoint("sft"))
+    return run
+
+
+def contexts_drawn(run, contexts):
+    """Contexts [iterations, G] of a run whose groups are mixed where they start from the first two states."""
+    drawn = []
+
+    def returns_of(wave):
+        drawn.append(wave[keys.CONTEXT_ID][:, 0, 0, 0].tolist())
+        return torch.tensor([[1.0, float(number > 1)] for number in drawn[-1]])
+
+    settings = dataclasses.replace(run.config.post_train, contexts=contexts)
+    run = dataclasses.replace(run, config=dataclasses.replace(run.config, post_train=settings))
+    post_train(run, "sft", "post_train", "", returns_of=returns_of)
+    return drawn
+
+
+def test_mixed_contexts_are_drawn_by_the_returns_that_are_learned_from(physics):
+    sampler, expected = ContextSampler(seed=physics.config.seed), []
+    for _ in range(4):
+        expected.append(sampler.draw(range(4), 2))  # of one task, ids are places
+        returns = torch.tensor([[1.0, float(number > 1)] for number in expected[-1]])
+        sampler.update(torch.tensor(expected[-1]), returns)
+    assert contexts_drawn(physics, "mixed") == expected
+    seen = [line["contexts_seen"] for line in physics.folder.read_metrics("post_train")]
+    assert seen == [len({number for wave in expected[: i + 1] for number in wave}) for i in range(4)]
+
+
+def test_uniform_contexts_come_in_shuffled_passes(physics):
+    drawn = contexts_drawn(physics, "uniform")
+    assert sorted(drawn[0] + drawn[1]) == sorted(drawn[2] + drawn[3]) == [0, 1, 2, 3]
+    assert all("contexts_seen" not in line for line in physics.folder.read_metrics("post_train"))
 
 
 def test_iterations_that_stop_after_their_first_update_are_counted_and_said():
