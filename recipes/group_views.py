@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from direct_predictor import fit_direct, predict_direct
 from real_groups import RealGroups
 from worldenv_trl.data import Episodes, imagine_episodes, score_episodes
 from worldenv_trl.kinematics import ForwardKinematics
@@ -30,7 +31,7 @@ from worldenv_trl.metrics import (
 from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.world_models import WorldModel
 
-REAL, AHEAD, IMAGINED = "real frames", "one chunk ahead", "imagined"
+REAL, AHEAD, IMAGINED, DIRECT = "real frames", "one chunk ahead", "imagined", "no video"
 LATE = 2  # frames by which the goal may be reached after a stop in imagination, whose time is not exact
 
 
@@ -135,6 +136,15 @@ def views(
         AHEAD: view(judge, groups, ahead),
         IMAGINED: view(judge, groups, imagined),
     }, ahead
+
+
+def direct_view(explored: Episodes, kinematics: ForwardKinematics, groups: RealGroups, tasks: int) -> View:
+    """What a predictor of success says that is trained on ``explored`` and sees no video; stopped is above one half."""
+    seen_by = groups.episodes.cameras
+    predictor = fit_direct(explored.through(seen_by), kinematics, tasks)
+    prob = groups.grouped(predict_direct(predictor, groups.episodes, kinematics))
+    end = groups.grouped(groups.episodes["length"].squeeze(-1))
+    return View(returns=prob, largest=prob, end=end, stopped=prob > 0.5, done=groups.success, success=groups.success)
 
 
 def curve(

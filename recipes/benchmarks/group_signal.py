@@ -14,7 +14,9 @@ bootstrap over groups:
 - ECE (expected calibration error, ten bins) and slope of the return against the goal being reached by the end.
 
 Rows: the reflector on the real frames (its ceiling); one chunk ahead (real frames as memory at the start of every
-chunk); imagination. The second table is r when real frames are shown to the first chunks only: when the truth is lost.
+chunk); imagination; with ``--direct`` a predictor from first frames, task and the hand's path, trained on the run's
+exploration: what needs no video. The last table is r when real frames are shown to the first chunks only: when the
+truth is lost.
 """
 
 from __future__ import annotations
@@ -34,11 +36,13 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from command_line import at_least, refusals
+from episodes import demonstrations_and_exploration
 from gather_evidence import read_config
-from group_views import AHEAD, FIGURES, IMAGINED, Judge, curve, figures, mean_correlation, views
+from group_views import AHEAD, DIRECT, FIGURES, IMAGINED, Judge, curve, direct_view, figures, mean_correlation, views
 from real_groups import Draw, RealGroups, check_draw, real_groups
 from run import Run, read_rules
 from run_folder import RunFolder
+from worldenv_trl.data import Episodes
 from worldenv_trl.metrics import Estimate
 from worldenv_trl.record.mcap.provenance import model_hash
 from worldenv_trl.report import RunRecord
@@ -72,6 +76,8 @@ class Settings:
     to another imagination of the mixed groups."""
     against: Path | None = None
     """JSON that other models left for the same groups: the difference of r, group by group, is shown, too."""
+    direct: bool = False
+    """Also train the predictor that sees no video (a minute or two)."""
     resamples: int = 1000
     """Of the bootstrap."""
     out: Path | None = None
@@ -97,6 +103,7 @@ def main(settings: Settings) -> Path:
         policy = run.parts.policy.load(paths["policy"])
         world_model = run.parts.world_model.load(paths["world_model"]).eval()
         judge = Judge(run.parts.reflector.load(paths["reflector"]).eval(), read_rules(paths["reflector"]))
+        explored = demonstrations_and_exploration(run, 1)[1] if settings.direct else None
         before = None if settings.against is None else read_report(settings.against)
         folder = settings.groups or settings.run / "signal" / paths["policy"].name
         groups = real_groups(run, policy, draw, folder, settings.overwrite)
@@ -111,7 +118,7 @@ def main(settings: Settings) -> Path:
         }
         if before is not None:
             _check_comparable(report, before, settings.against)
-        report |= measure(run, groups, world_model, judge, settings, before)
+        report |= measure(run, groups, world_model, judge, settings, explored, before)
     out = settings.out or folder / f"{paths['world_model'].name}-{paths['reflector'].name}.json"
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
@@ -161,9 +168,13 @@ def measure(
     world_model: WorldModel,
     judge: Judge,
     settings: Settings,
+    explored: Episodes | None = None,
     before: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """All figures as plain values, by view, task and name: ``[value, low, high]``, None where one cannot be said."""
+    """All figures as plain values, by view, task and name: ``[value, low, high]``, None where one cannot be said.
+
+    ``explored``: what the predictor without video learns from; ``before``: a report of the same groups to compare with.
+    """
     started = time.monotonic()
     seen, ahead = views(judge, world_model, run.kinematics, groups)
     chunks = math.ceil(groups.episodes["actions"].shape[1] / world_model.chunk_length)
@@ -171,6 +182,9 @@ def measure(
     shown_to = {1: seen[IMAGINED].correlations}
     shown_to |= curve(judge, world_model, run.kinematics, groups, (seen[AHEAD], ahead), between)
     shown_to[chunks] = seen[AHEAD].correlations
+    if explored is not None:
+        torch.manual_seed(1000 * settings.seed + 61)
+        seen[DIRECT] = direct_view(explored, run.kinematics, groups, len(run.config.tasks))
     numbers, kinds = groups.task_id, {"all": torch.ones_like(groups.task_id, dtype=torch.bool)}
     kinds |= {task: numbers == place for place, task in enumerate(run.config.tasks)}
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
+from functools import partial
 
 import pytest
 import torch
 from tensordict import TensorDict
 from test_benchmarks import benchmark
 
-from group_views import AHEAD, FIGURES, IMAGINED, REAL, Judge, curve, views
+from direct_predictor import fit_direct
+from group_views import AHEAD, DIRECT, FIGURES, IMAGINED, REAL, Judge, curve, views
 from parts import make_policy, make_reflector, make_world_model
 from real_groups import Draw, RealGroups, real_groups
 from run import Run, write_rules
@@ -111,6 +114,17 @@ def test_the_command_leaves_its_figures(run, capsys):
     assert "| real frames | all |" in (shown := capsys.readouterr().out) and "calibration error" in shown
     again = command(run, against=out, out=out.with_name("again.json"))
     assert set(json.loads(again.read_text())["gain"]) == {"all", *run.config.tasks}
+
+
+def test_what_needs_no_video_learns_from_the_exploration(run, monkeypatch):
+    with pytest.raises(SystemExit, match=r"demonstrations.mcap does not exist: run the stage 'demonstrate'"):
+        command(run, direct=True)
+    command(run)
+    for name in ("demonstrations", "explore"):
+        shutil.copy(run.folder.path / "signal" / "sft" / "groups.mcap", run.folder.rollouts(name))
+    monkeypatch.setattr("group_views.fit_direct", partial(fit_direct, steps=2))
+    views = json.loads(command(run, direct=True).read_text())["views"]
+    assert list(views) == [REAL, AHEAD, IMAGINED, DIRECT]
 
 
 @pytest.mark.parametrize(
