@@ -71,7 +71,7 @@ class Settings:
     """Folder of the groups, RUN/signal/POLICY if not given. Groups that are there are read, not drawn again."""
     overwrite: bool = False
     """Draw the groups again."""
-    shown_chunks: tuple[int, ...] = (2, 3, 4, 6)
+    shown_chunks: tuple[int, ...] = (2, 4, 6)
     """Numbers of chunks, at least 2, up to which real frames are shown; 1 and all are always there. Each number is up
     to another imagination of the mixed groups."""
     against: Path | None = None
@@ -81,7 +81,8 @@ class Settings:
     resamples: int = 1000
     """Of the bootstrap."""
     out: Path | None = None
-    """JSON of all figures; WORLD_MODEL-REFLECTOR.json beside the groups if not given."""
+    """JSON of all figures; WORLD_MODEL-REFLECTOR.json beside the groups if not given, with the beginning of their
+    hashes where they are not the run's."""
     num_threads: int = 1
 
 
@@ -106,20 +107,25 @@ def main(settings: Settings) -> Path:
         explored = demonstrations_and_exploration(run, 1)[1] if settings.direct else None
         before = None if settings.against is None else read_report(settings.against)
         folder = settings.groups or settings.run / "signal" / paths["policy"].name
+        models = {"policy": policy, "world_model": world_model, "reflector": judge.reflector}
+        hashes = {name: model_hash(model) for name, model in models.items()}
         groups = real_groups(run, policy, draw, folder, settings.overwrite)
+        groups.episodes.require("the world model", world_model.cameras, world_model.image_size)
+        groups.episodes.require("the reflector", judge.reflector.cameras, judge.reflector.image_size)
         report = {
             "draw": asdict(draw),
-            "models": {
-                name: {"path": str(paths[name]), "hash": model_hash(model)}
-                for name, model in (("policy", policy), ("world_model", world_model), ("reflector", judge.reflector))
-            },
+            "models": {name: {"path": str(path), "hash": hashes[name]} for name, path in paths.items()},
             "rules": {name: asdict(rule) for name, rule in judge.rules.items()},
             "context_id": groups.context_id.tolist(),
         }
         if before is not None:
             _check_comparable(report, before, settings.against)
-        report |= measure(run, groups, world_model, judge, settings, explored, before)
-    out = settings.out or folder / f"{paths['world_model'].name}-{paths['reflector'].name}.json"
+    report |= measure(run, groups, world_model, judge, settings, explored, before)
+    names = [
+        path.name if path.parent == run.folder.path / "checkpoints" else f"{path.name}_{hashes[name][:8]}"
+        for name, path in paths.items()
+    ]
+    out = settings.out or folder / f"{'-'.join(names[1:])}.json"
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
     print(markdown(report))

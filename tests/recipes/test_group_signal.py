@@ -112,7 +112,9 @@ def test_the_command_leaves_its_figures(run, capsys):
     assert list(report["views"][IMAGINED]) == list(report["curve"]) == ["all", *run.config.tasks]
     assert list(report["views"][REAL]["all"]) == list(FIGURES) and list(report["curve"]["all"]) == ["1", "2"]
     assert "| real frames | all |" in (shown := capsys.readouterr().out) and "calibration error" in shown
-    again = command(run, against=out, out=out.with_name("again.json"))
+    other = shutil.copytree(run.folder.checkpoint("world_model"), run.folder.path / "elsewhere")
+    again = command(run, against=out, world_model=str(other))
+    assert again == out.with_name(f"elsewhere_{report['models']['world_model']['hash'][:8]}-reflector.json")
     assert set(json.loads(again.read_text())["gain"]) == {"all", *run.config.tasks}
 
 
