@@ -42,10 +42,18 @@ class FrameSink:
     def __init__(self, capacity: int, folder: str | os.PathLike | None = None) -> None:
         storage = LazyTensorStorage(capacity) if folder is None else LazyMemmapStorage(capacity, scratch_dir=folder)
         self.buffer = ReplayBuffer(storage=storage, batch_size=1)
-        self._on_disk = folder is not None
+        self._capacity, self._on_disk = capacity, folder is not None
 
     def add(self, frames: TensorDictBase) -> None:
-        """``frames`` [n] behind those that are there."""
+        """``frames`` [n] behind those that are there.
+
+        Raises:
+            ValueError: if they are more than there is room for; none of them is taken.
+        """
+        if len(self.buffer) + len(frames) > self._capacity:  # the buffer would write over its first ones, in silence
+            raise ValueError(
+                f"there is room for {self._capacity} frames, {len(self.buffer)} are there: {len(frames)} do not fit"
+            )
         with _without_notices():
             self.buffer.extend(frames)
         if self._on_disk:
