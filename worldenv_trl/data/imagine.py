@@ -49,6 +49,7 @@ def imagine_episodes(
 
     Raises:
         ValueError: for episodes that do not show the model's cameras at its size.
+        OSError: if the disk of ``folder`` has no room for the frames.
     """
     episodes.require("the world model", world_model.cameras, world_model.image_size)
     sink = FrameSink(int((episodes["length"] + 1).sum()), folder)

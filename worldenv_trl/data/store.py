@@ -20,7 +20,7 @@ from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 from worldenv_trl.data.episodes import Episodes, check_alike, concatenated
 from worldenv_trl.data.from_rollouts import episodes_from_rollouts
 from worldenv_trl.keys import ACTION, CHUNK
-from worldenv_trl.memmap import release
+from worldenv_trl.memmap import check_room, release
 from worldenv_trl.record import list_rollouts, read_metadata, read_rollouts
 from worldenv_trl.record.mcap.recording import Recording
 
@@ -42,21 +42,25 @@ class FrameSink:
     def __init__(self, capacity: int, folder: str | os.PathLike | None = None) -> None:
         storage = LazyTensorStorage(capacity) if folder is None else LazyMemmapStorage(capacity, scratch_dir=folder)
         self.buffer = ReplayBuffer(storage=storage, batch_size=1)
-        self._capacity, self._on_disk = capacity, folder is not None
+        self._capacity, self._folder = capacity, None if folder is None else Path(folder)
 
     def add(self, frames: TensorDictBase) -> None:
         """``frames`` [n] behind those that are there.
 
         Raises:
             ValueError: if they are more than there is room for; none of them is taken.
+            OSError: if the disk has no room for as many as there may be; nothing is written.
         """
+        if self._folder is not None and not len(self.buffer) and len(frames):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            check_room(self._folder, self._capacity * frames[:1].bytes(), "the frames of the episodes")
         if len(self.buffer) + len(frames) > self._capacity:  # the buffer would write over its first ones, in silence
             raise ValueError(
                 f"there is room for {self._capacity} frames, {len(self.buffer)} are there: {len(frames)} do not fit"
             )
         with _without_notices():
             self.buffer.extend(frames)
-        if self._on_disk:
+        if self._folder is not None:
             release(self.frames)
 
     @property
@@ -102,7 +106,6 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
     for part in (part for path, count in counts.items() for part in _parts(path, count)):
         frames, _ = part.video
         if sink is None or alike is None:
-            _check_room(partial, capacity, frames)
             sink = FrameSink(capacity, partial / "frames")
             alike = Episodes(part.entries[:0], [], frames[:0].clone())
         check_alike([alike, part])
@@ -203,13 +206,6 @@ def _longest(path: str | os.PathLike) -> int:
     one = read_rollouts(path, rollouts=[0])
     steps = 1 if one.get(ACTION, None) is not None else one[CHUNK].shape[-2]
     return steps * max(info.length for info in list_rollouts(path))
-
-
-def _check_room(folder: Path, count: int, frames: TensorDictBase) -> None:
-    need = count * sum(value[0].numel() for value in frames.values(True, True))
-    free = shutil.disk_usage(folder).free
-    if need > free:
-        raise OSError(f"the frames of the episodes take {need / 1e9:.1f} GB, {folder} has {free / 1e9:.1f} GB free")
 
 
 def _identity(path: str | os.PathLike) -> dict[str, str | int]:
