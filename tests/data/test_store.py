@@ -87,6 +87,15 @@ def test_several_writes_of_different_lengths_are_one_recording(tmp_path):
     assert same(part, read(path)) and part["length"].flatten().tolist() == [3, 5, 9, 2, 4]
 
 
+@pytest.mark.filterwarnings("ignore:.*truncated")
+def test_what_a_damaged_recording_has_lost_is_not_taken_from_the_next(tmp_path):
+    cut = record(tmp_path / "cut.mcap", *[step_rollouts(LENGTHS, steps=5) for _ in range(4)])
+    whole = record(tmp_path / "whole.mcap", step_rollouts(LENGTHS, steps=5))
+    cut.write_bytes(cut.read_bytes()[: cut.stat().st_size * 3 // 10])
+    first, second = fill_store(tmp_path / "store", [cut, whole])
+    assert 0 < len(read(cut)) < 10 and same(first, read(cut)) and same(second, read(whole))
+
+
 def test_all_recordings_share_one_set_of_frames_on_disk(tmp_path, steps, decisions):
     parts = fill_store(tmp_path / "store", [steps, decisions])
     together = Episodes.cat(parts)

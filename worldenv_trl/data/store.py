@@ -72,7 +72,8 @@ class FrameSink:
 def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike]) -> list[Episodes]:
     """Reads ``recordings`` (MCAP) into ``folder``, which is replaced, and opens it; see :func:`open_store`.
 
-    Small entries are kept beside the frames. Only some rollouts are in memory at a time.
+    Small entries are kept beside the frames. Only some rollouts are in memory at a time. A damaged recording gives what
+    :func:`~worldenv_trl.record.read_rollouts` reads of it, with its warning.
 
     Raises:
         ValueError: for recordings that cannot be made into episodes, or of different entries, cameras or sizes, or one
@@ -103,7 +104,8 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
     texts: list[str] = []
     counts = {path: Recording(Path(path)).count() for path in recordings}
     capacity = sum(count * (_longest(path) + 1) for path, count in counts.items() if count)
-    for part in (part for path, count in counts.items() for part in _parts(path, count)):
+    held = dict.fromkeys(counts, 0)  # of a damaged recording fewer than it counts
+    for path, part in ((each, part) for each, count in counts.items() for part in _parts(each, count)):
         frames, _ = part.video
         if sink is None or alike is None:
             sink = FrameSink(capacity, partial / "frames")
@@ -112,6 +114,7 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
         sink.add(frames)
         entries.append(part.entries)
         texts += part.instructions
+        held[path] += len(part)
     if sink is None:
         raise ValueError(f"there are no rollouts in {', '.join(map(str, recordings)) or 'no recordings'}")
     concatenated(entries).memmap(partial / "entries")
@@ -119,7 +122,7 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
     manifest = {
         "format": _FORMAT,
         "recordings": [_identity(path) for path in recordings],
-        "counts": list(counts.values()),
+        "counts": list(held.values()),
         "frames": len(sink.frames),
         "files": {str(path.relative_to(partial)): path.stat().st_size for path in _files(partial)},
         "instructions": distinct,
