@@ -132,6 +132,6 @@ def test_a_sink_shows_the_frames_that_it_was_given_and_no_others(tmp_path):
 def test_a_full_disk_is_noticed_before_frames_are_written(tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
-    with pytest.raises(OSError, match="the frames of the episodes take .* GB free"):
+    with pytest.raises(OSError, match=r"the frames of the episodes take .* GB free"):
         imagined(folder=tmp_path / "imagined")
     assert not list(tmp_path.rglob("*.memmap"))

@@ -96,7 +96,7 @@ def test_a_full_disk_is_noticed_before_frames_are_written(scratch, monkeypatch):
     usage = shutil.disk_usage(scratch)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
     env = aside_env(keep=True)
-    with pytest.raises(OSError, match="the frames of a decision take .* GB free"):
+    with pytest.raises(OSError, match=r"the frames of a decision take .* GB free"):
         play(env)
     assert not list(scratch.rglob("*.memmap"))
 
