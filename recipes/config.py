@@ -30,6 +30,9 @@ class SFT:
     weight_decay: float = 1e-4
     shift_px: int = 2
     """Random image shift, the augmentation that helps with five demonstrations."""
+    cameras: tuple[str, ...] = ()
+    """Cameras that the policy looks through, of the run's; all of them when empty. World model and reflector may see
+    more than it does."""
     dim: int = 128
     depth: int = 2
     vision_blocks: tuple[int, ...] = ()

@@ -47,7 +47,7 @@ class Imagination:
             proprio=PROPRIO,
             seed=run.config.seed,
         )
-        return TransformedEnv(env, Compose(Reflect(self.reflector, self.rule), FramesAside()))
+        return TransformedEnv(env, Compose(Reflect(self.reflector, self.rule), FramesAside(run.folder.path)))
 
 
 def frames_aside(env: EnvBase) -> FramesAside | None:

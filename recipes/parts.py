@@ -49,7 +49,7 @@ def make_policy(config: WorldEnvConfig) -> OFTPolicy:
     policy = OFTPolicy(
         OFTConfig(
             instructions=instructions(config),
-            cameras=config.cameras,
+            cameras=settings.cameras or config.cameras,
             image_size=config.image_size,
             chunk_length=config.chunk_length,
             proprio=PROPRIO,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 import torch
 from small_rollouts import CAMERAS, make_episodes, same
@@ -167,3 +169,11 @@ def test_a_sink_shows_the_frames_that_it_was_given_and_no_others(tmp_path):
         for part in frames.split(7):
             sink.add(part)
         assert len(sink.frames) == len(frames) and (sink.frames == frames).all()
+
+
+def test_a_full_disk_is_noticed_before_frames_are_written(tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
+    with pytest.raises(OSError, match=r"the frames of the episodes take .* GB free"):
+        imagined(folder=tmp_path / "imagined")
+    assert not list(tmp_path.rglob("*.memmap"))

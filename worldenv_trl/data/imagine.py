@@ -60,6 +60,7 @@ def imagine_episodes(
     Raises:
         ValueError: for episodes that do not show the model's cameras at its size, ``shown_chunks`` below 1 or
             ``painted`` of another number.
+        OSError: if the disk of ``folder`` has no room for the frames.
     """
     episodes.require("the world model", world_model.cameras, world_model.image_size)
     if shown_chunks is not None and shown_chunks < 1:
