@@ -1,4 +1,4 @@
-"""Greedy success of a policy, in the physics and in imagination."""
+"""Success of a policy, greedy unless told otherwise, in the physics and in imagination."""
 
 from __future__ import annotations
 
@@ -43,11 +43,12 @@ def physics_outcomes(
     judge: Judge | None = None,
     writer: RolloutWriter | None = None,
     label: str = "",
+    exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
 ) -> torch.Tensor:
     """Success bool ``[episodes]`` of the first initial states of a split, or of those at ``indices``, in order.
 
     The goal predicate ends an episode, or, with a ``judge``, the reflector alone does: then success is whether the
-    goal holds in the moment it stops (or at the step limit).
+    goal holds in the moment it stops (or at the step limit). Actions are greedy unless ``exploration_type`` differs.
     """
     options: dict[str, Any] = {"init_state_count": episodes}
     if indices is not None:  # these initial states of the split only
@@ -65,7 +66,7 @@ def physics_outcomes(
         groups_per_batch=num_envs,
         group_size=1,
         total_groups=waves * num_envs,
-        exploration_type=ExplorationType.DETERMINISTIC,
+        exploration_type=exploration_type,
     )
     outcome: dict[int, bool] = {}
     for wave in tqdm(collector, total=waves, desc=f"{label} {task}", unit="wave", leave=False, disable=not label):

@@ -11,6 +11,7 @@ from torch import nn
 
 from config import WorldEnvConfig
 from worldenv_trl.kinematics import ForwardKinematics
+from worldenv_trl.language import split_words
 from worldenv_trl.policies import OFTConfig, OFTPolicy, Policy
 from worldenv_trl.reflectors import CompactLessons, CompactReflector, CompactReflectorConfig, Reflector
 from worldenv_trl.scenes import load_task
@@ -56,6 +57,7 @@ def make_policy(config: WorldEnvConfig) -> OFTPolicy:
             dim=settings.dim,
             depth=settings.depth,
             vision_blocks=settings.vision_blocks,
+            max_words=max([16, *(len(split_words(text)) for text in instructions(config))]),
         )
     )
     if settings.vision_blocks:
@@ -71,6 +73,7 @@ def make_world_model(config: WorldEnvConfig) -> VideoWorldModel:
         VideoWorldModelConfig.for_cameras(
             {name: {task.language: task.camera(name) for task in tasks} for name in config.cameras},
             patch=settings.patch,
+            memory_stride=min(4, config.chunk_length),
             width=settings.width,
             num_denoise_steps=settings.denoise_steps,
             deterministic=settings.deterministic,

@@ -7,6 +7,7 @@ Alone: ``python recipes/post_train.py improve --run-dir runs/improve``.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import cast
 
 import torch
@@ -29,8 +30,27 @@ from worldenv_trl.policies import Policy, laplace_actor
 from worldenv_trl.record import RolloutWriter
 
 
-def post_train(run: Run, source: str, target: str, models: str) -> None:
-    """Improves checkpoint ``source`` in the world model and reflector of round ``models``; writes ``target``."""
+def collected_returns(wave: TensorDictBase) -> torch.Tensor:
+    """The return ``[G, N]`` of each rollout of a wave ``[G, N, T]``: what the env gave."""
+    return wave["returns"][..., 0]
+
+
+def post_train(
+    run: Run,
+    source: str,
+    target: str,
+    models: str,
+    *,
+    returns_of: Callable[[TensorDictBase], torch.Tensor] = collected_returns,
+    watch: Callable[[int, Policy], None] | None = None,
+) -> None:
+    """Improves checkpoint ``source`` in the world model and reflector of round ``models``; writes ``target``.
+
+    Keyword Args:
+        returns_of: from a wave ``[G, N, T]`` to the returns ``[G, N]`` that are learned from.
+        watch: called before the first iteration and after each one with the number of iterations done and the policy
+            that would be saved now, which it must leave as it is, like torch's random numbers.
+    """
     config, settings = run.config, run.config.post_train
     run.seed_everything(offset=50)
     policy = run.policy(source, "sft")
@@ -69,13 +89,15 @@ def post_train(run: Run, source: str, target: str, models: str) -> None:
     alarm = HonestyAlarm(len(probed), false_alarm_rate=settings.false_alarm_rate) if probed and imagination else None
     aside = frames_aside(env)
     _record_next(True, collector, aside)
+    if watch is not None:
+        watch(0, averaged)
     progress, started = tqdm(collector, total=settings.iterations, desc=target, unit="it"), time.monotonic()
     stuck_for = 0
     for iteration, wave in enumerate(progress):
         factor = rate_factor(iteration, settings)
         for group, rate in zip(optimizer.param_groups, full_rates, strict=True):
             group["lr"] = factor * rate
-        returns = wave["returns"][..., 0]  # [G, N]
+        returns = returns_of(wave)  # [G, N]
         advantage = rloo_advantage(returns)
         if settings.standardize:
             advantage = advantage / advantage.std().clamp_min(1e-6)
@@ -104,6 +126,9 @@ def post_train(run: Run, source: str, target: str, models: str) -> None:
         run.folder.log(target, step=iteration, **metrics)
         progress.set_postfix({k: f"{metrics[k]:.3f}" for k in ("return", "kl_approx", "real_success") if k in metrics})
         del wave  # before the next one is collected
+        if watch is not None:
+            watch(iteration + 1, averaged)
+            started = time.monotonic()  # the next iteration's
         _record_next(iteration + 1 in recorded, collector, aside)
     collector.shutdown()
     averaged.save_pretrained(run.folder.checkpoint(target))
