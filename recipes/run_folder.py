@@ -85,7 +85,8 @@ class RunFolder:
         stored = self.path / "config.yaml"
         if stored.exists():
             old = yaml.safe_load(stored.read_text())
-            before, now = _flat(old), _flat(new)
+            # What has become a setting since then was at its default.
+            before, now = _flat(_plain(dataclasses.asdict(type(config)()))) | _flat(old), _flat(new)
             free = {"run_dir", "num_threads"}
             changed = [key for key in now if before.get(key) != now[key] and key not in free]
             if changed:
