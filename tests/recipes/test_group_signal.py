@@ -56,7 +56,7 @@ def with_outcomes(groups: RealGroups, reached: list[int]) -> RealGroups:
 
 
 def test_groups_are_drawn_once_and_share_their_initial_states(run, tmp_path):
-    policy = run.policy("sft", "sft")
+    policy = run.policy("sft")
     groups = real_groups(run, policy, DRAW, tmp_path / "groups")
     assert groups.task_id.tolist() == [0, 0, 1, 1] and groups.success.shape == (4, 2)
     ids = [context_id(task, "train", index) for task in (0, 1) for index in (0, 3)]
@@ -89,7 +89,7 @@ class FirstPixel(Reflector):
 
 
 def test_views_hold_returns_of_the_reflector_and_success_of_the_physics(run, tmp_path):
-    groups = with_outcomes(real_groups(run, run.policy("sft", "sft"), DRAW, tmp_path), [3, -1, -1, -1, 5, 6, -1, 9])
+    groups = with_outcomes(real_groups(run, run.policy("sft"), DRAW, tmp_path), [3, -1, -1, -1, 5, 6, -1, 9])
     assert groups.mixed.tolist() == [True, False, False, True]
     judge = Judge(FirstPixel(), {"real": StopRule(0.99, 1), "imagined": StopRule(0.01, 2)})
     seen, ahead = views(judge, run.world_model(), run.kinematics, groups)
