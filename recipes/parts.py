@@ -61,7 +61,7 @@ def make_policy(config: WorldEnvConfig) -> OFTPolicy:
         )
     )
     if settings.vision_blocks:
-        policy.load_vision(settings.vision_weights)
+        policy.load_vision(config.vision_weights)
     return policy
 
 
@@ -85,8 +85,13 @@ def make_world_model(config: WorldEnvConfig) -> VideoWorldModel:
 
 def make_reflector(config: WorldEnvConfig) -> CompactReflector:
     settings = config.reflector
-    return CompactReflector(
-        CompactReflectorConfig(instructions=instructions(config), cameras=config.cameras, image_size=config.image_size),
+    reflector = CompactReflector(
+        CompactReflectorConfig(
+            instructions=instructions(config),
+            cameras=config.cameras,
+            image_size=config.image_size,
+            vision_blocks=settings.vision_blocks,
+        ),
         lessons=CompactLessons(
             encoder_steps=settings.encoder_steps,
             steps=settings.steps,
@@ -94,6 +99,9 @@ def make_reflector(config: WorldEnvConfig) -> CompactReflector:
             lr=settings.lr,
         ),
     )
+    if settings.vision_blocks:
+        reflector.load_vision(config.vision_weights)
+    return reflector
 
 
 COMPACT = Parts(
