@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from config import WorldEnvConfig
+from parts import COMPACT, Parts
 from physics import tabletop
+from worldenv_trl.reflectors import StopRule
 from worldenv_trl.scenes import load_task
 
 
-def check_config(config: WorldEnvConfig) -> None:
-    """Fails before any long work starts if a task is unknown, a setting impossible or no GL backend renders."""
+def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
+    """Fails before any long work starts if a task is unknown, a setting impossible or no GL backend renders.
+
+    What only the compact parts refuse is found by making those of them that ``parts`` holds; others, which may take
+    long to make, are not made.
+
+    Raises:
+        ValueError: naming the setting.
+        RuntimeError: if nothing can be drawn.
+    """
     if not config.tasks:
         raise ValueError("tasks is empty: name at least one task, for instance starter/open_the_top_drawer")
     if len(set(config.tasks)) < len(config.tasks):
@@ -20,24 +30,44 @@ def check_config(config: WorldEnvConfig) -> None:
     ):
         if value not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    unseen = [camera for camera in config.sft.cameras if camera not in config.cameras]
+    if unseen:
+        raise ValueError(
+            f"sft.cameras must be of the run's cameras, {', '.join(config.cameras)}, got {', '.join(unseen)}: "
+            "add them to cameras"
+        )
     counts = (
         ("num_threads", config.num_threads),
         ("rounds", config.rounds),
         ("train_states", config.train_states),
+        ("chunk_length", config.chunk_length),
         ("demonstrate.episodes_per_task", config.demonstrate.episodes_per_task),
         ("explore.episodes_per_task", config.explore.episodes_per_task),
         ("explore.num_envs", config.explore.num_envs),
         ("sft.steps", config.sft.steps),
+        ("sft.batch_size", config.sft.batch_size),
         ("world_model.steps", config.world_model.steps),
+        ("world_model.refit_steps", config.world_model.refit_steps),
+        ("world_model.batch_size", config.world_model.batch_size),
         ("post_train.iterations", config.post_train.iterations),
         ("post_train.groups", config.post_train.groups),
+        ("post_train.epochs", config.post_train.epochs),
+        ("post_train.minibatch_size", config.post_train.minibatch_size),
+        ("post_train.probe_contexts", config.post_train.probe_contexts),
         ("evaluate.episodes_per_task", config.evaluate.episodes_per_task),
+        ("evaluate.num_envs", config.evaluate.num_envs),
     )
     for name, count in counts:
         if count < 1:
             raise ValueError(f"{name} must be at least 1, got {count}")
     if config.post_train.group_size < 2:
         raise ValueError(f"post_train.group_size must be at least 2, got {config.post_train.group_size}")
+    for name, rows, dealt in (
+        ("explore.num_envs", config.explore.num_envs, True),
+        ("post_train.groups", config.post_train.groups, config.post_train.env == "tabletop"),
+    ):
+        if dealt and rows < len(config.tasks):
+            raise ValueError(f"{name} must be at least {len(config.tasks)}, one for each task, got {rows}")
     if not config.explore.scale_factors or min(config.explore.scale_factors) < 0:
         raise ValueError(
             f"explore.scale_factors must be one number or more, none negative, got {config.explore.scale_factors}"
@@ -50,6 +80,14 @@ def check_config(config: WorldEnvConfig) -> None:
     ):
         if share is not None and not 0 <= share <= 1:
             raise ValueError(f"{name} must lie between 0 and 1, got {share}")
+    if not 0 < config.post_train.false_alarm_rate < 1:
+        raise ValueError(
+            f"post_train.false_alarm_rate must lie between 0 and 1, got {config.post_train.false_alarm_rate}"
+        )
+    try:
+        StopRule(config.reflector.threshold, config.reflector.consecutive)
+    except ValueError as error:
+        raise ValueError(f"reflector.{error}") from error
     if not all(floor > 0 for floor in config.scale_floor):
         raise ValueError(f"scale_floor must be positive, got {config.scale_floor}")
     if not 0 <= config.scale_share <= 1:
@@ -71,3 +109,10 @@ def check_config(config: WorldEnvConfig) -> None:
             f"got {config.image_size}"
         )
     tabletop(config, "train", len(config.tasks), None).close()
+    for name in ("policy", "world_model", "reflector"):
+        part = getattr(parts, name)
+        if part is getattr(COMPACT, name):
+            try:
+                part.make(config)
+            except ValueError as error:
+                raise ValueError(f"the {name.replace('_', ' ')} cannot be made of these settings: {error}") from error

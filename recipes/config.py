@@ -30,13 +30,13 @@ class SFT:
     weight_decay: float = 1e-4
     shift_px: int = 2
     """Random image shift, the augmentation that helps with five demonstrations."""
+    cameras: tuple[str, ...] = ()
+    """Cameras that the policy looks through, of the run's; all of them when empty. World model and reflector may see
+    more than it does."""
     dim: int = 128
     depth: int = 2
     vision_blocks: tuple[int, ...] = ()
-    """Blocks of a frozen ImageNet encoder that the policy sees through, too, for instance 2 4 10; its weights come with
-    the extra ``vision``."""
-    vision_weights: Path | None = None
-    """The encoder's weights; those of the extra ``vision`` when None."""
+    """Blocks of a frozen ImageNet encoder that the policy sees through, too, for instance 2 4 10."""
     scale_steps: int = 200
     scale_lr: float = 1e-3
 
@@ -80,6 +80,8 @@ class WorldModel:
 class Reflector:
     """Instant reflector: frozen encoder, trained reward head."""
 
+    vision_blocks: tuple[int, ...] = ()
+    """Blocks of a frozen ImageNet encoder that it sees through, too, for instance 4 10."""
     encoder_steps: int = 600
     steps: int = 1000
     batch_size: int = 32
@@ -157,6 +159,8 @@ class WorldEnvConfig:
     cameras: tuple[str, ...] = ("agentview",)
     """Cameras that every part sees through: ``agentview``, ``wrist`` and any other that the scenes have."""
     image_size: int = 64
+    vision_weights: Path | None = None
+    """Weights of the frozen ImageNet encoder; those of the extra ``vision`` when None."""
     chunk_length: int = 8
     max_steps: int = 72
     """Env steps (20 Hz) of an episode at most, a multiple of ``chunk_length``."""

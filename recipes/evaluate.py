@@ -30,7 +30,7 @@ def evaluate(run: Run, before: str, after: str, models: str | None) -> None:
     for protocol in ("physics",) if reflector is None else ("physics", "reflector"):
         outcomes: dict[str, dict[str, torch.Tensor]] = {}
         for name in (before, after):
-            policy = run.policy(name, "post_train")
+            policy = run.policy(name)
             actor = laplace_actor(policy)
             judge = reflector if protocol == "reflector" else None
             described = outcomes_env(run, config.tasks[0], "test", 1, judge, with_sim_state=True)

@@ -21,7 +21,7 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
     """Rolls checkpoint ``policy`` on the training initial states; writes ``rollouts/<target>.mcap``."""
     config, folder, settings = run.config, run.folder, run.config.explore
     run.seed_everything(offset=20 + len(target))
-    model = run.policy(policy, "sft").eval()
+    model = run.policy(policy).eval()
     per_scale = -(-settings.episodes_per_task * len(config.tasks) // len(settings.scale_factors))
     waves = -(-per_scale // settings.num_envs)
     # After success the rollout goes on: the models must see what undoes it (World-Env Figure 6).

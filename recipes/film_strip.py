@@ -49,7 +49,7 @@ def main(settings: Settings) -> None:
         config = read_config(RunRecord.read(settings.run), settings.num_threads)
         run = Run(config, RunFolder(settings.run))
         models = run.world_model(), run.reflector(), run.rules()
-        actor = laplace_actor(run.policy(settings.policy, "post_train").eval())
+        actor = laplace_actor(run.policy(settings.policy).eval())
     torch.set_num_threads(settings.num_threads)
     count = settings.state + 1
     episodes = live(run, actor, count)

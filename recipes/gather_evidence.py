@@ -53,7 +53,7 @@ def gather(
     worlds: dict[str, TwoWorlds] = {}
     for name in policies:
         print(f"{name}: {episodes_per_task} held-out episodes a task, in the physics and in imagination")
-        actor = laplace_actor(run.policy(name, name).eval())
+        actor = laplace_actor(run.policy(name).eval())
         worlds[name] = imagine(run, world_model, reflector, rules, live(run, actor, episodes_per_task))
     waves = []
     for path in _waves(record, suffix):

@@ -55,7 +55,7 @@ class Imagination:
             seed=run.config.seed,
             context_sampler=sampler,
         )
-        return TransformedEnv(env, Compose(Reflect(self.reflector, self.rule), FramesAside()))
+        return TransformedEnv(env, Compose(Reflect(self.reflector, self.rule), FramesAside(run.folder.path)))
 
 
 def frames_aside(env: EnvBase) -> FramesAside | None:

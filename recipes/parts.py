@@ -11,6 +11,7 @@ from torch import nn
 
 from config import WorldEnvConfig
 from worldenv_trl.kinematics import ForwardKinematics
+from worldenv_trl.language import split_words
 from worldenv_trl.policies import OFTConfig, OFTPolicy, Policy
 from worldenv_trl.reflectors import CompactLessons, CompactReflector, CompactReflectorConfig, Reflector
 from worldenv_trl.scenes import load_task
@@ -49,17 +50,18 @@ def make_policy(config: WorldEnvConfig) -> OFTPolicy:
     policy = OFTPolicy(
         OFTConfig(
             instructions=instructions(config),
-            cameras=config.cameras,
+            cameras=settings.cameras or config.cameras,
             image_size=config.image_size,
             chunk_length=config.chunk_length,
             proprio=PROPRIO,
             dim=settings.dim,
             depth=settings.depth,
             vision_blocks=settings.vision_blocks,
+            max_words=max([16, *(len(split_words(text)) for text in instructions(config))]),
         )
     )
     if settings.vision_blocks:
-        policy.load_vision(settings.vision_weights)
+        policy.load_vision(config.vision_weights)
     return policy
 
 
@@ -71,6 +73,7 @@ def make_world_model(config: WorldEnvConfig) -> VideoWorldModel:
         VideoWorldModelConfig.for_cameras(
             {name: {task.language: task.camera(name) for task in tasks} for name in config.cameras},
             patch=settings.patch,
+            memory_stride=min(4, config.chunk_length),
             width=settings.width,
             num_denoise_steps=settings.denoise_steps,
             deterministic=settings.deterministic,
@@ -82,8 +85,13 @@ def make_world_model(config: WorldEnvConfig) -> VideoWorldModel:
 
 def make_reflector(config: WorldEnvConfig) -> CompactReflector:
     settings = config.reflector
-    return CompactReflector(
-        CompactReflectorConfig(instructions=instructions(config), cameras=config.cameras, image_size=config.image_size),
+    reflector = CompactReflector(
+        CompactReflectorConfig(
+            instructions=instructions(config),
+            cameras=config.cameras,
+            image_size=config.image_size,
+            vision_blocks=settings.vision_blocks,
+        ),
         lessons=CompactLessons(
             encoder_steps=settings.encoder_steps,
             steps=settings.steps,
@@ -91,6 +99,9 @@ def make_reflector(config: WorldEnvConfig) -> CompactReflector:
             lr=settings.lr,
         ),
     )
+    if settings.vision_blocks:
+        reflector.load_vision(config.vision_weights)
+    return reflector
 
 
 COMPACT = Parts(

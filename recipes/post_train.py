@@ -53,7 +53,7 @@ def post_train(
     """
     config, settings = run.config, run.config.post_train
     run.seed_everything(offset=50)
-    policy = run.policy(source, "sft")
+    policy = run.policy(source)
     groups = policy.post_training_parameters(settings.lora_rank)
     actor = exploring_actor(config, policy, settings.scale_factor)
 

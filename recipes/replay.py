@@ -13,14 +13,16 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
 from command_line import one_line_errors
 from parts import COMPACT, Kind, Part, Parts
-from worldenv_trl.policies import laplace_actor
+from worldenv_trl.policies import LaplaceActor, Policy, laplace_actor, scale_bounds
 from worldenv_trl.record import model_hash, parse_edit, read_metadata, replay
 from worldenv_trl.record.replay.source import open_rollout
 
@@ -70,7 +72,8 @@ def main(options: Options, parts: Parts = COMPACT) -> int:
     reflector = options.reflector or ("recorded" if options.threshold is not None else None)
     policy = None
     if options.policy is not None:
-        policy = laplace_actor(_checkpoint(parts.policy, options.policy, options.file, metadata, "policy"))
+        acting = _checkpoint(parts.policy, options.policy, options.file, metadata, "policy")
+        policy = recorded_actor(acting, metadata.get("config", {}))
     edits: dict[int, dict[int, float]] = {}
     for text in options.edit:
         for step, values in parse_edit(text).items():
@@ -98,6 +101,15 @@ def main(options: Options, parts: Parts = COMPACT) -> int:
     if options.json is not None and str(options.json) != "-":
         options.json.write_text(words + "\n")
     return 0
+
+
+def recorded_actor(policy: Policy, settings: Mapping[str, Any]) -> LaplaceActor:
+    """The policy with the noise of exploration and LOOP, as the ``settings`` of a recording's run have it; with its own
+    trained scale where there are none."""
+    if "scale_floor" not in settings:
+        return laplace_actor(policy)
+    bounds = scale_bounds(policy, tuple(settings["scale_floor"]), share=settings["scale_share"])
+    return laplace_actor(policy, scale_factor=settings["post_train"]["scale_factor"], log_scale_bounds=bounds)
 
 
 def _checkpoint(part: Part[Kind], name: str | None, file: Path, metadata: dict, kind: str) -> Kind:

@@ -34,7 +34,8 @@ class Run:
         """Each stage has its own stream, so a stage run alone draws the same numbers as in the whole loop."""
         torch.manual_seed(1000 * self.config.seed + offset)
 
-    def policy(self, name: str, stage: str) -> Policy:
+    def policy(self, name: str) -> Policy:
+        stage = "sft" if name == "sft" else "post_train"
         return self.parts.policy.load(self.folder.require_checkpoint(name, stage))
 
     def world_model(self, suffix: str = "") -> WorldModel:

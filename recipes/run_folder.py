@@ -1,8 +1,9 @@
 """One folder per run: what every stage reads from and writes to.
 
 ``checkpoints/`` learned parts, ``rollouts/*.mcap`` logged rollouts, ``episodes/`` their frames on disk (a cache),
-``metrics.jsonl`` one line a measurement, ``plots/*.png``, ``config.yaml`` the exact settings, ``versions.json`` the
-packages it ran with, ``stages/`` one marker per finished stage, ``report.html``.
+``metrics.jsonl`` one line a measurement, ``plots/*.png``, ``config.yaml`` the exact settings, ``tasks.json`` the
+digest of each task, ``versions.json`` the packages it ran with, ``stages/`` one marker per finished stage,
+``report.html``.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class RunFolder:
     """A resumable run on disk.
 
     A stage is finished when its marker exists; its outputs are written under their final names only when complete, so
-    a crash loses at most the running stage and ``run_stage`` simply runs that stage again.
+    a crash loses at most the running stage, which simply runs again.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -84,7 +85,8 @@ class RunFolder:
         stored = self.path / "config.yaml"
         if stored.exists():
             old = yaml.safe_load(stored.read_text())
-            before, now = _flat(old), _flat(new)
+            # What has become a setting since then was at its default.
+            before, now = _flat(_plain(dataclasses.asdict(type(config)()))) | _flat(old), _flat(new)
             free = {"run_dir", "num_threads"}
             changed = [key for key in now if before.get(key) != now[key] and key not in free]
             if changed:

@@ -62,7 +62,8 @@ def _train(
     run: Run,
     name: str,
 ) -> None:
-    settings, images = run.config.sft, [keys.image_key(camera) for camera in run.config.cameras]
+    settings = run.config.sft
+    images = [keys.image_key(camera) for camera in settings.cameras or run.config.cameras]
     optimizer = torch.optim.AdamW(parameters, lr=lr, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))

@@ -108,7 +108,7 @@ def parse(arguments: Sequence[str], module: str = "__main__") -> WorldEnvConfig:
 def open_run(config: WorldEnvConfig, parts: Parts = COMPACT) -> Run:
     """The run of checked settings; what is wrong with them is said in one line."""
     try:
-        check_config(config)
+        check_config(config, parts)
         folder = RunFolder(config.run_dir)
         folder.open(config, {task: load_task(task).digest for task in config.tasks})
     except (ValueError, OSError, RuntimeError) as error:

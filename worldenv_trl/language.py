@@ -54,7 +54,7 @@ class Vocabulary:
 
     Args:
         words: all words, :data:`PAD_WORD` and :data:`UNKNOWN_WORD` first; see :meth:`of`.
-        max_words: longest instruction.
+        max_words: of a longer instruction, the words behind are not read.
 
     Examples:
         >>> vocabulary = Vocabulary(Vocabulary.of(["open the drawer", "turn on the stove"]))
@@ -89,7 +89,7 @@ class Vocabulary:
                 training, a row does not depend on which others are in its batch.
 
         Raises:
-            ValueError: for an instruction without words, or of more than ``max_words``.
+            ValueError: for an instruction without words.
         """
         rows = [self._of_text(text) for text in instructions]
         length = max([min_length, *map(len, rows)])
@@ -98,9 +98,9 @@ class Vocabulary:
 
     def _of_text(self, text: str) -> list[int]:
         if text not in self._cache:
-            words = split_words(text)
-            if not 0 < len(words) <= self.max_words:
-                raise ValueError(f"an instruction must have 1 to {self.max_words} words, got {text!r}")
+            words = split_words(text)[: self.max_words]
+            if not words:
+                raise ValueError(f"an instruction must have a word, got {text!r}")
             self._cache[text] = [self._ids.get(word, self._ids[UNKNOWN_WORD]) for word in words]
         return self._cache[text]
 

@@ -3,14 +3,26 @@
 from __future__ import annotations
 
 import ctypes
+import os
+import shutil
 import sys
 
 from tensordict import TensorDictBase
 
-__all__ = ["Reading", "release"]
+__all__ = ["Reading", "check_room", "release"]
 
 _DONTNEED = 4  # of madvise
 _MOST = 128_000_000  # bytes that are read before they are given back
+
+
+def check_room(folder: str | os.PathLike, nbytes: int, what: str) -> None:
+    """Raises ``OSError`` unless the disk of ``folder`` has room for ``what`` ("the frames of the episodes").
+
+    To be asked before files are mapped: writing to one that the disk cannot hold kills the process without a word.
+    """
+    free = shutil.disk_usage(folder).free
+    if nbytes > free:
+        raise OSError(f"{what} take {nbytes / 1e9:.1f} GB, {folder} has {free / 1e9:.1f} GB free")
 
 
 class Reading:

@@ -61,7 +61,7 @@ def main(settings: Settings) -> None:
     demonstrate(run)
     fine_tune(run)
     run.seed_everything(offset=90)
-    actor = laplace_actor(run.policy("sft", "sft"))
+    actor = laplace_actor(run.policy("sft"))
     print("| task | solved |\n|---|---|")
     everything = []
     for task in tasks:

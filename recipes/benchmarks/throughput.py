@@ -52,7 +52,8 @@ class _Timed(WorldModel):
     """A world model that adds up the seconds spent inside it."""
 
     def __init__(self, model: WorldModel) -> None:
-        super().__init__(cameras=model.cameras, image_size=model.image_size, chunk_length=model.chunk_length)
+        sizes = {"image_size": model.image_size, "chunk_length": model.chunk_length}
+        super().__init__(cameras=model.cameras, instructions=model.seen.instructions, **sizes)
         self.model, self.seconds = model, 0.0
 
     def memory_indices(self, now: torch.Tensor) -> torch.Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 import torch
 from small_rollouts import CAMERAS, make_episodes, same
@@ -94,6 +96,48 @@ def test_the_model_is_asked_with_the_poses_actions_and_goals_of_the_recording():
         assert instructions_of(td) == real.instructions
 
 
+class StumblingWorldModel(CountingWorldModel):
+    """Counts one too far in every frame: what it remembers shows."""
+
+    def forward(self, tensordict):
+        super().forward(tensordict)
+        for camera in self.cameras:
+            tensordict[keys.frames_key(camera)][:, :, 0] += 1
+        return tensordict
+
+
+def stumbling() -> StumblingWorldModel:
+    return StumblingWorldModel(CopyingConfig(cameras=CAMERAS, image_size=8, chunk_length=C, stride=2))
+
+
+@pytest.mark.parametrize(("shown", "errors"), [(1, [1, 2, 3]), (2, [1, 1, 2]), (3, [1, 1, 1]), (None, [1, 1, 1])])
+def test_chunks_that_are_shown_the_truth_remember_recorded_frames(shown, errors):
+    episodes = imagined(stumbling(), shown_chunks=shown)
+    for camera, more in zip(CAMERAS, (0, 7), strict=True):
+        off = [error for error in errors for _ in range(C)]
+        assert colour(episodes, camera, 2, 0)[1:] == [100 + more + 1 + step + off[step] for step in range(3 * C)]
+        remembered = [100, 100 + C - 2, 100 + 2 * C - 2]  # two frames before the newest one
+        drift = [0, *(off[C * chunk - 3] if shown is not None and chunk >= shown else 0 for chunk in (1, 2))]
+        blue = [frame + more + error for frame, error in zip(remembered, drift, strict=True)]
+        assert colour(episodes, camera, 2, 2)[1:] == [value for value in blue for _ in range(C)]
+
+
+@pytest.mark.parametrize("shown", [1, 2, 3])
+def test_chunks_that_were_painted_before_are_not_painted_again(shown):
+    model = stumbling()
+    ahead = imagined(model, shown_chunks=None)
+    model.requests.clear()
+    again = imagined(model, shown_chunks=shown, painted=ahead, rows_at_once=5)
+    assert same(again, imagined(stumbling(), shown_chunks=shown)) and len(model.requests) == 3 - shown
+
+
+def test_no_chunk_is_without_its_first_frame():
+    with pytest.raises(ValueError, match="shown_chunks must be at least 1, got 0"):
+        imagined(shown_chunks=0)
+    with pytest.raises(ValueError, match="painted must be the same 5 episodes, got 4"):
+        imagined(painted=make_episodes(LENGTHS[:4]))
+
+
 @pytest.mark.parametrize("rows_at_once", [1, 2])
 def test_how_many_episodes_are_imagined_at_once_changes_nothing(rows_at_once):
     assert same(imagined(rows_at_once=rows_at_once), imagined())
@@ -125,3 +169,11 @@ def test_a_sink_shows_the_frames_that_it_was_given_and_no_others(tmp_path):
         for part in frames.split(7):
             sink.add(part)
         assert len(sink.frames) == len(frames) and (sink.frames == frames).all()
+
+
+def test_a_full_disk_is_noticed_before_frames_are_written(tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
+    with pytest.raises(OSError, match=r"the frames of the episodes take .* GB free"):
+        imagined(folder=tmp_path / "imagined")
+    assert not list(tmp_path.rglob("*.memmap"))

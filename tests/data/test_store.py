@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from small_rollouts import decision_rollouts, same, step_rollouts
+from tensordict import TensorDict
 
 from worldenv_trl import keys
 from worldenv_trl.data import Episodes, episodes_from_rollouts, fill_store, open_store, store
@@ -84,6 +85,15 @@ def test_several_writes_of_different_lengths_are_one_recording(tmp_path):
     path = record(tmp_path / "a.mcap", step_rollouts([3, 5], steps=5), step_rollouts([9, 2, 4], steps=9, seed=1))
     (part,) = fill_store(tmp_path / "store", [path])
     assert same(part, read(path)) and part["length"].flatten().tolist() == [3, 5, 9, 2, 4]
+
+
+@pytest.mark.filterwarnings("ignore:.*truncated")
+def test_what_a_damaged_recording_has_lost_is_not_taken_from_the_next(tmp_path):
+    cut = record(tmp_path / "cut.mcap", *[step_rollouts(LENGTHS, steps=5) for _ in range(4)])
+    whole = record(tmp_path / "whole.mcap", step_rollouts(LENGTHS, steps=5))
+    cut.write_bytes(cut.read_bytes()[: cut.stat().st_size * 3 // 10])
+    first, second = fill_store(tmp_path / "store", [cut, whole])
+    assert 0 < len(read(cut)) < 10 and same(first, read(cut)) and same(second, read(whole))
 
 
 def test_all_recordings_share_one_set_of_frames_on_disk(tmp_path, steps, decisions):
@@ -263,6 +273,16 @@ def test_recordings_with_and_without_labels_are_refused(tmp_path, steps):
     unlabelled = record(tmp_path / "imagined.mcap", decision_rollouts([[3, 2]]))
     with pytest.raises(ValueError, match="success labels"):
         fill_store(tmp_path / "store", [steps, unlabelled])
+
+
+@pytest.mark.parametrize("on_disk", [True, False])
+def test_more_frames_than_there_is_room_for_are_refused_and_the_first_stay(tmp_path, on_disk):
+    sink = store.FrameSink(3, tmp_path / "frames" if on_disk else None)
+    frames = TensorDict({keys.frames_key("agentview"): torch.full((2, 3, 8, 8), 7, dtype=torch.uint8)}, [2])
+    sink.add(frames)
+    with pytest.raises(ValueError, match="room for 3 frames, 2 are there: 2 do not fit"):
+        sink.add(frames + 1)
+    assert len(sink.frames) == 2 and bool((sink.frames[keys.frames_key("agentview")] == 7).all())
 
 
 def test_no_recordings_are_refused(tmp_path):

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 from torchrl.data import Unbounded
-from torchrl.envs.transforms import RewardSum, StepCounter, TransformedEnv
+from torchrl.envs.transforms import MultiAction, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from worldenv_trl.envs import ExpertPolicy, TabletopEnv, chunked
@@ -224,3 +224,9 @@ def test_chunks_that_cannot_be_are_refused():
             env.step(td.clone().set(CHUNK, chunk))
     with pytest.raises(ValueError, match="NaN"):
         env.step(td.clone().set(CHUNK, torch.full((2, C, 7), torch.nan)))
+
+
+def test_a_chunk_key_is_what_multi_action_reads():
+    env = TransformedEnv(make(cameras=()), MultiAction.from_vla(stack_rewards=False))
+    td = env.reset().set(CHUNK, torch.zeros(2, 3, 7))
+    assert (env.step(td)["next", NUM_STEPS] == 3).all()

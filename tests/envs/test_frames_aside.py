@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -16,8 +17,8 @@ from worldenv_trl.envs import FramesAside
 BOTH = [keys.frames_key(camera) for camera in TWO]
 
 
-def aside_env(keep: bool, **settings) -> TransformedEnv:
-    env = TransformedEnv(make_env(**settings), FramesAside())
+def aside_env(keep: bool, folder: Path | None = None) -> TransformedEnv:
+    env = TransformedEnv(make_env(), FramesAside(folder))
     env.transform.keep = keep
     return env
 
@@ -82,6 +83,22 @@ def test_kept_frames_are_on_disk_until_the_next_reset(scratch):
     env.transform.keep = False
     env.reset()
     assert not list(scratch.iterdir())
+
+
+def test_files_go_where_they_are_told(scratch, tmp_path_factory):
+    elsewhere = tmp_path_factory.mktemp("run")
+    env = aside_env(True, elsewhere)
+    play(env)
+    assert list(elsewhere.rglob("*.memmap")) and not list(scratch.iterdir())
+
+
+def test_a_full_disk_is_noticed_before_frames_are_written(scratch, monkeypatch):
+    usage = shutil.disk_usage(scratch)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
+    env = aside_env(keep=True)
+    with pytest.raises(OSError, match=r"the frames of a decision take .* GB free"):
+        play(env)
+    assert not list(scratch.rglob("*.memmap"))
 
 
 def test_every_wave_keeps_its_own_frames(scratch):

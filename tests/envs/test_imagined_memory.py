@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from imagined_worlds import FK, SIZE, TWO, C, CountingWorldModel, given, make_env, with_chunk
@@ -69,6 +71,11 @@ def test_frames_are_kept_only_if_the_world_model_will_ask_for_them():
     ):
         env = make_env(max_steps=4 * C, world_model=RememberingWorldModel(indices))
         assert kept(env) == len(expected)
+
+
+def test_everything_that_rows_are_looked_up_in_moves_with_the_env():
+    env = copy.deepcopy(make_env()).to("meta")  # a copy: tests share their kinematics
+    assert {env._slot.device.type, env._poses.device.type, env._kept("agentview").device.type} == {"meta"}
 
 
 def test_the_compact_world_model_has_two_frames_of_each_decision_kept():

@@ -10,7 +10,6 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 from worldenv_trl.envs import ExpertPolicy, TabletopEnv, context_id
 from worldenv_trl.keys import (
     ACTION,
-    CHUNK,
     CONTEXT_ID,
     IMAGE,
     INSTRUCTION,
@@ -393,9 +392,3 @@ def test_a_closed_env_says_so_whether_it_drew_or_not():
         for call in (env.reset, lambda env=env: env.rollout(2), lambda env=env, td=td: env.rand_step(td)):
             with pytest.raises(RuntimeError, match=r"this TabletopEnv was closed.*: build another one"):
                 call()
-
-
-def test_a_chunk_key_is_what_multi_action_reads():
-    env = TransformedEnv(make(n=2, cameras=()), MultiAction.from_vla(stack_rewards=False))
-    td = env.reset().set(CHUNK, actions(3, 2).transpose(0, 1))
-    assert (env.step(td)["next", NUM_STEPS] == 3).all()

@@ -5,7 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
-from worldenv_trl.metrics import choose_rule, first_success, frame_figures, judged, stop_figures
+from worldenv_trl.metrics import (
+    choose_rule,
+    first_success,
+    frame_figures,
+    judged,
+    largest_scores,
+    loop_returns,
+    stop_figures,
+)
 from worldenv_trl.reflectors import StopRule
 
 FRAMES = 12
@@ -93,3 +101,24 @@ def test_a_stop_ends_the_episode_and_may_come_a_little_early():
 def test_the_first_success_is_found():
     success = torch.tensor([[False, True, False], [False, False, False], [True, True, True]])
     assert first_success(success).tolist() == [1, -1, 0]
+
+
+def test_the_return_is_r_where_the_rollout_ends():
+    scores = torch.rand(50, FRAMES, generator=torch.Generator().manual_seed(0))
+    length = torch.randint(1, FRAMES, (50,), generator=torch.Generator().manual_seed(1))
+    alive, rule = torch.arange(FRAMES) <= length.unsqueeze(-1), StopRule(0.6, 2)
+    expected = []
+    for row in range(50):
+        streak = 0
+        for frame in range(1, int(length[row]) + 1):
+            streak = streak + 1 if scores[row, frame] > rule.threshold else 0
+            if streak == rule.consecutive:
+                break
+        expected.append(scores[row, frame].item())
+    assert loop_returns(scores, rule.first(scores, alive), alive).tolist() == expected
+
+
+def test_the_largest_score_is_of_frames_that_were_lived():
+    scores = torch.tensor([[0.9, 0.2, 0.4, 0.8], [0.3, 0.9, 0.9, 0.9]])
+    alive = torch.tensor([[True, True, True, False], [True, False, False, False]])
+    assert largest_scores(scores, alive).tolist() == pytest.approx([0.4, 0.3])

@@ -211,6 +211,7 @@ def test_other_image_sizes_and_chunk_lengths_work():
     [
         ({"image_size": 62}, "got 62"),
         ({"instructions": ()}, "got none"),
+        ({"max_words": 3}, "max_words=3 is less than the words of the instruction 'put the bowl on the plate'"),
         ({"dim": 30}, "num_heads"),
         ({"stem_widths": (8,)}, "two entries"),
     ],

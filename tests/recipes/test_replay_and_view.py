@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 
@@ -9,13 +10,18 @@ import pytest
 import torch
 import tyro
 from foxglove import Channel, Context, open_mcap
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import replay as replay_recipe
 import view as view_recipe
+from config import PRESETS
+from physics import exploring_actor
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import ImaginedEnv, TabletopEnv
 from worldenv_trl.kinematics import ForwardKinematics
+from worldenv_trl.policies import OFTConfig, OFTPolicy
 from worldenv_trl.record import RolloutWriter, provenance, read_metadata, read_rollouts
 from worldenv_trl.world_models import VideoWorldModel, VideoWorldModelConfig
 
@@ -138,3 +144,22 @@ def test_foxglove_gets_a_layout_of_the_recording(run, tmp_path, capsys, monkeypa
     assert call(view_recipe, run / "rollouts" / "dream.mcap", "--viewer", "foxglove", "--save", target) == 0
     assert "Import from file" in capsys.readouterr().out
     assert "Plot!action" in json.loads(target.read_text())["configById"]
+
+
+def test_a_sampled_what_if_has_the_noise_of_the_run_that_was_recorded():
+    policy = OFTPolicy(OFTConfig(("open the drawer",), image_size=32, dim=32))
+    td = TensorDict(
+        {"observation": {"image": torch.zeros(1, 3, 32, 32, dtype=torch.uint8), "state": torch.zeros(1, 7)}}
+    )
+    td = td.auto_batch_size_(1).set(keys.INSTRUCTION, "open the drawer")
+    config = PRESETS["improve"][1]
+    exploring = exploring_actor(config, policy, config.post_train.scale_factor)
+    recorded = replay_recipe.recorded_actor(policy, json.loads(json.dumps(dataclasses.asdict(config), default=str)))
+    own = replay_recipe.recorded_actor(policy, {})
+    with set_exploration_type(ExplorationType.RANDOM):
+        chunks = []
+        for actor in (exploring, recorded, own):
+            torch.manual_seed(0)
+            chunks.append(actor(td.copy())[keys.CHUNK])
+    assert torch.equal(chunks[0], chunks[1])
+    assert not torch.equal(chunks[0], chunks[2])

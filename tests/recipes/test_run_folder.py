@@ -46,6 +46,19 @@ def test_the_same_settings_continue_a_run_and_others_are_refused_by_name(config,
     assert SFT().steps != 7
 
 
+def test_a_setting_that_is_newer_than_the_folder_counts_as_its_default(tmp_path):
+    config = dataclasses.replace(PRESETS["smoke"][1], run_dir=tmp_path / "run")
+    folder = RunFolder(config.run_dir)
+    folder.open(config)
+    stored = folder.path / "config.yaml"
+    stored.write_text("".join(line for line in stored.read_text().splitlines(True) if "shift_px" not in line))
+    folder.open(config)
+    assert "shift_px: 2" in stored.read_text()
+    stored.write_text("".join(line for line in stored.read_text().splitlines(True) if "shift_px" not in line))
+    with pytest.raises(ValueError, match=r"sft.shift_px=2, now 3: use another --run-dir"):
+        folder.open(dataclasses.replace(config, sft=dataclasses.replace(config.sft, shift_px=3)))
+
+
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
     path = tmp_path / "file"
     path.write_text("precious")

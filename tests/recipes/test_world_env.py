@@ -11,8 +11,9 @@ import torch
 
 import world_env
 from checks import check_config
-from config import GOAL_TASKS, PRESETS, Demonstrate, Explore, PostTrain, WorldModel
+from config import GOAL_TASKS, PRESETS, SFT, Demonstrate, Evaluate, Explore, PostTrain, Reflector, WorldModel
 from imagination import read_contexts
+from parts import COMPACT, Part
 from run import Run
 from run_folder import RunFolder
 from stages import open_run, parse, plan, rerun
@@ -53,11 +54,27 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"post_train": PostTrain(ratio_level="foo")}, "ratio_level must be one of step, chunk, got 'foo'"),
         ({"post_train": PostTrain(contexts="hard")}, "contexts must be one of uniform, mixed, got 'hard'"),
         ({"post_train": PostTrain(group_size=1)}, "group_size must be at least 2"),
+        ({"chunk_length": 0}, "chunk_length must be at least 1, got 0"),
+        ({"explore": Explore(num_envs=2)}, "explore.num_envs must be at least 3, one for each task, got 2"),
+        ({"post_train": PostTrain(env="tabletop", groups=2)}, "post_train.groups must be at least 3, one for each"),
+        ({"post_train": PostTrain(minibatch_size=0)}, "post_train.minibatch_size must be at least 1"),
+        ({"post_train": PostTrain(false_alarm_rate=1.0)}, "post_train.false_alarm_rate must lie between 0 and 1"),
+        ({"evaluate": Evaluate(num_envs=0)}, "evaluate.num_envs must be at least 1"),
+        ({"reflector": Reflector(threshold=1.5)}, r"reflector.threshold must be in \(0, 1\), got 1.5"),
+        ({"sft": SFT(dim=126)}, "the policy cannot be made of these settings: dim must be a multiple"),
+        ({"world_model": WorldModel(patch=8)}, "the world model cannot be made of these settings: patch must leave"),
+        ({"world_model": WorldModel(denoise_steps=9)}, "num_denoise_steps must lie between 1 and 4, got 9"),
+        ({"reflector": Reflector(steps=0)}, "the reflector cannot be made of these settings: .*steps"),
     ],
 )
 def test_bad_settings_fail_before_any_work_starts(change, message):
     with pytest.raises(ValueError, match=message):
         check_config(dataclasses.replace(PRESETS["smoke"][1], **change))
+
+
+def test_what_the_compact_parts_refuse_is_no_matter_for_other_parts():
+    config = dataclasses.replace(PRESETS["smoke"][1], image_size=32)  # too small for the compact world model
+    check_config(config, dataclasses.replace(COMPACT, world_model=Part(make=pytest.fail, load=pytest.fail)))
 
 
 def test_the_command_names_a_bad_setting_in_one_line(tiny):

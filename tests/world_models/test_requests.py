@@ -10,7 +10,7 @@ from swaps.copying_world_model import CopyingConfig, CopyingWorldModel
 from tensordict import TensorDict
 
 from worldenv_trl.keys import INSTRUCTION, NOISE_SEED, frames_key
-from worldenv_trl.language import instructions_of
+from worldenv_trl.language import SeenInstructions, instructions_of
 from worldenv_trl.world_models import WorldModel, request
 
 CAMERAS = ("agentview", "wrist", "left of the table")
@@ -117,3 +117,19 @@ def test_a_copying_world_model_is_saved_and_loaded_like_any_other(tmp_path):
     model.save_pretrained(tmp_path)
     again = CopyingWorldModel.from_pretrained(tmp_path)
     assert again.config == model.config and again.cameras == CAMERAS
+
+
+def test_an_instruction_that_was_not_trained_on_is_warned_of_whatever_the_model():
+    model = world_model()
+    model.seen = SeenInstructions("the world model of this test", ["pull"])
+    with pytest.warns(UserWarning, match="the world model of this test was never trained on the instruction 'push'"):
+        asked(model, [0, 0])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"image_size": 0}, "must be at least 1, got 0 and 4"), ({"chunk_length": 0}, "must be at least 1, got 8 and 0")],
+)
+def test_sizes_that_cannot_be_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        CopyingWorldModel(CopyingConfig(**{"image_size": 8, "chunk_length": 4} | wrong))

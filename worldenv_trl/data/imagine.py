@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 
 import torch
 from tensordict import TensorDict
@@ -25,6 +26,8 @@ def imagine_episodes(
     episodes: Episodes,
     kinematics: ForwardKinematics,
     *,
+    shown_chunks: int | None = 1,
+    painted: Episodes | None = None,
     rows_at_once: int = 16,
     seed: int = 0,
     progress: str | None = None,
@@ -32,12 +35,19 @@ def imagine_episodes(
 ) -> Episodes:
     """The same actions from the same first frames, imagined open loop on the model's own frames.
 
+    With more ``shown_chunks`` the model is told the truth for longer: so many chunks, from the first on, are painted
+    with the recorded frames before them as the model's memory, the later ones with its own. What is seen is always what
+    it painted. Between 1, imagination, and None, every chunk from a real past, lies what drift costs.
+
     Args:
         world_model: paints chunks of ``C`` frames.
         episodes: their frames show the model's cameras.
         kinematics: FK(s, a).
 
     Keyword Args:
+        shown_chunks: see above, at least 1 (the first chunk has nothing but the recorded frame); None is all.
+        painted: these episodes as the same model imagined them with at least as many shown chunks (and the same seed):
+            the shown chunks are taken from there instead of being painted again.
         rows_at_once: episodes in memory at a time.
         seed: of the model's noise, for each episode and chunk.
         progress: label of a progress bar; None shows none.
@@ -48,21 +58,36 @@ def imagine_episodes(
         ``kinematic_states`` are predicted; ``success`` stays that of the physics under the same actions.
 
     Raises:
-        ValueError: for episodes that do not show the model's cameras at its size.
+        ValueError: for episodes that do not show the model's cameras at its size, ``shown_chunks`` below 1 or
+            ``painted`` of another number.
+        OSError: if the disk of ``folder`` has no room for the frames.
     """
     episodes.require("the world model", world_model.cameras, world_model.image_size)
+    if shown_chunks is not None and shown_chunks < 1:
+        raise ValueError(f"shown_chunks must be at least 1, got {shown_chunks}")
+    if painted is not None:
+        if len(painted) != len(episodes):
+            raise ValueError(f"painted must be the same {len(episodes)} episodes, got {len(painted)}")
+        painted.require("the world model", world_model.cameras, world_model.image_size)
+    shown = -(-episodes["actions"].shape[1] // world_model.chunk_length) if shown_chunks is None else shown_chunks
     sink = FrameSink(int((episodes["length"] + 1).sum()), folder)
     states = []
     for start in tqdm(range(0, len(episodes), rows_at_once), desc=progress, unit="batch", disable=progress is None):
-        part = episodes[start : start + rows_at_once]
-        video, predicted = _imagine(world_model, part, kinematics, seed + start)
-        sink.add(video[part.alive])
+        part = slice(start, start + rows_at_once)
+        known = None if painted is None else painted[part]
+        video, predicted = _imagine(world_model, episodes[part], kinematics, seed + start, shown, known)
+        sink.add(video[episodes[part].alive])
         states.append(predicted)
     return episodes.with_video(sink.frames, kinematic_states=torch.cat(states))
 
 
 def _imagine(
-    world_model: WorldModel, episodes: Episodes, kinematics: ForwardKinematics, seed: int
+    world_model: WorldModel,
+    episodes: Episodes,
+    kinematics: ForwardKinematics,
+    seed: int,
+    shown: int,
+    painted: Episodes | None,
 ) -> tuple[TensorDict, Tensor]:
     """Video [R, T + 1] and kinematic states [R, T + 1, 20]."""
     rows, steps = episodes["actions"].shape[:2]
@@ -77,17 +102,32 @@ def _imagine(
         real = episodes.frames(camera, row[:, 0], torch.zeros(rows, dtype=torch.int64))
         video[frames_key(camera)] = real.new_zeros(*video.batch_size, *real.shape[1:])
         video[frames_key(camera)][:, 0] = real
+    real_until = min(shown - 1, steps // length) * length  # the last frame of which a real one is remembered
+    truth = video.clone() if real_until else video
+    for camera in world_model.cameras if real_until else ():
+        truth[frames_key(camera)][:, : real_until + 1] = episodes.frames(camera, row, torch.arange(real_until + 1))
     for start in range(0, steps, length):
+        chunk = torch.arange(start + 1, start + length + 1)
+        if painted is not None and start < shown * length:
+            for camera in world_model.cameras:
+                video[frames_key(camera)][:, chunk] = painted.frames(camera, row, chunk)
+            continue
+        memory = truth if start <= real_until else video
         asked = request(
             world_model,
-            lambda numbers: video[row, numbers],
+            partial(_recall, memory, row),
             torch.full((rows,), start),
-            video["poses"][:, start + 1 : start + length + 1],
-            actions[:, start : start + length],
+            video["poses"][:, chunk],
+            actions[:, chunk - 1],
             episodes.instructions,
             noise_seed=(seed + row) * 1009 + start,
         )
-        painted = world_model(asked)
+        frames = world_model(asked)
         for camera in world_model.cameras:
-            video[frames_key(camera)][:, start + 1 : start + length + 1] = painted[frames_key(camera)]
+            video[frames_key(camera)][:, chunk] = frames[frames_key(camera)]
     return video.exclude("poses")[:, : steps + 1], states[:, : steps + 1]
+
+
+def _recall(video: TensorDict, row: Tensor, numbers: Tensor) -> TensorDict:
+    """Frames and poses [R, K] by their numbers [R, K]."""
+    return video[row, numbers]

@@ -20,7 +20,7 @@ from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 from worldenv_trl.data.episodes import Episodes, check_alike, concatenated
 from worldenv_trl.data.from_rollouts import episodes_from_rollouts
 from worldenv_trl.keys import ACTION, CHUNK
-from worldenv_trl.memmap import release
+from worldenv_trl.memmap import check_room, release
 from worldenv_trl.record import list_rollouts, read_metadata, read_rollouts
 from worldenv_trl.record.mcap.recording import Recording
 
@@ -42,13 +42,25 @@ class FrameSink:
     def __init__(self, capacity: int, folder: str | os.PathLike | None = None) -> None:
         storage = LazyTensorStorage(capacity) if folder is None else LazyMemmapStorage(capacity, scratch_dir=folder)
         self.buffer = ReplayBuffer(storage=storage, batch_size=1)
-        self._on_disk = folder is not None
+        self._capacity, self._folder = capacity, None if folder is None else Path(folder)
 
     def add(self, frames: TensorDictBase) -> None:
-        """``frames`` [n] behind those that are there."""
+        """``frames`` [n] behind those that are there.
+
+        Raises:
+            ValueError: if they are more than there is room for; none of them is taken.
+            OSError: if the disk has no room for as many as there may be; nothing is written.
+        """
+        if self._folder is not None and not len(self.buffer) and len(frames):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            check_room(self._folder, self._capacity * frames[:1].bytes(), "the frames of the episodes")
+        if len(self.buffer) + len(frames) > self._capacity:  # the buffer would write over its first ones, in silence
+            raise ValueError(
+                f"there is room for {self._capacity} frames, {len(self.buffer)} are there: {len(frames)} do not fit"
+            )
         with _without_notices():
             self.buffer.extend(frames)
-        if self._on_disk:
+        if self._folder is not None:
             release(self.frames)
 
     @property
@@ -60,7 +72,8 @@ class FrameSink:
 def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike]) -> list[Episodes]:
     """Reads ``recordings`` (MCAP) into ``folder``, which is replaced, and opens it; see :func:`open_store`.
 
-    Small entries are kept beside the frames. Only some rollouts are in memory at a time.
+    Small entries are kept beside the frames. Only some rollouts are in memory at a time. A damaged recording gives what
+    :func:`~worldenv_trl.record.read_rollouts` reads of it, with its warning.
 
     Raises:
         ValueError: for recordings that cannot be made into episodes, or of different entries, cameras or sizes, or one
@@ -91,16 +104,17 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
     texts: list[str] = []
     counts = {path: Recording(Path(path)).count() for path in recordings}
     capacity = sum(count * (_longest(path) + 1) for path, count in counts.items() if count)
-    for part in (part for path, count in counts.items() for part in _parts(path, count)):
+    held = dict.fromkeys(counts, 0)  # of a damaged recording fewer than it counts
+    for path, part in ((each, part) for each, count in counts.items() for part in _parts(each, count)):
         frames, _ = part.video
         if sink is None or alike is None:
-            _check_room(partial, capacity, frames)
             sink = FrameSink(capacity, partial / "frames")
             alike = Episodes(part.entries[:0], [], frames[:0].clone())
         check_alike([alike, part])
         sink.add(frames)
         entries.append(part.entries)
         texts += part.instructions
+        held[path] += len(part)
     if sink is None:
         raise ValueError(f"there are no rollouts in {', '.join(map(str, recordings)) or 'no recordings'}")
     concatenated(entries).memmap(partial / "entries")
@@ -108,7 +122,7 @@ def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike
     manifest = {
         "format": _FORMAT,
         "recordings": [_identity(path) for path in recordings],
-        "counts": list(counts.values()),
+        "counts": list(held.values()),
         "frames": len(sink.frames),
         "files": {str(path.relative_to(partial)): path.stat().st_size for path in _files(partial)},
         "instructions": distinct,
@@ -195,13 +209,6 @@ def _longest(path: str | os.PathLike) -> int:
     one = read_rollouts(path, rollouts=[0])
     steps = 1 if one.get(ACTION, None) is not None else one[CHUNK].shape[-2]
     return steps * max(info.length for info in list_rollouts(path))
-
-
-def _check_room(folder: Path, count: int, frames: TensorDictBase) -> None:
-    need = count * sum(value[0].numel() for value in frames.values(True, True))
-    free = shutil.disk_usage(folder).free
-    if need > free:
-        raise OSError(f"the frames of the episodes take {need / 1e9:.1f} GB, {folder} has {free / 1e9:.1f} GB free")
 
 
 def _identity(path: str | os.PathLike) -> dict[str, str | int]:

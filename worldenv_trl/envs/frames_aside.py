@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 
 from tensordict import LazyStackedTensorDict, TensorDictBase
@@ -9,7 +10,7 @@ from torchrl.data import Composite
 from torchrl.envs.transforms import Transform
 
 from worldenv_trl.keys import FRAMES
-from worldenv_trl.memmap import release
+from worldenv_trl.memmap import check_room, release
 
 __all__ = ["FramesAside"]
 
@@ -23,14 +24,22 @@ class FramesAside(Transform):
 
     :attr:`keep` may be set before a wave begins; then :meth:`frames` gives them afterwards.
 
+    Args:
+        folder: where the files go, until the wave after or the end of the program; None is the system's folder for
+            temporary files, which may be in memory.
+
+    Raises:
+        OSError: from a step, if the disk has no room for its frames.
+
     Examples:
         >>> aside = FramesAside()
         >>> aside.keep = True
     """
 
-    def __init__(self) -> None:
+    def __init__(self, folder: str | os.PathLike | None = None) -> None:
         super().__init__()
         self.keep = False
+        self._where = folder
         self._folder: tempfile.TemporaryDirectory | None = None
         self._decisions: list[TensorDictBase] = []
 
@@ -56,12 +65,13 @@ class FramesAside(Transform):
             self._decisions = []
             if self._folder is not None:
                 self._folder.cleanup()
-            self._folder = tempfile.TemporaryDirectory() if self.keep else None
+            self._folder = tempfile.TemporaryDirectory(dir=self._where) if self.keep else None
         return tensordict_reset.exclude(FRAMES)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self._folder is not None:
             shown = next_tensordict.select(FRAMES)
+            check_room(self._folder.name, shown.bytes(), "the frames of a decision")
             self._decisions.append(shown.memmap(f"{self._folder.name}/{len(self._decisions)}"))
             release(self._decisions[-1])
         return next_tensordict.exclude(FRAMES)

@@ -132,7 +132,8 @@ class ImaginedEnv(EnvBase):
         def buffer(name: str, *shape: int, dtype: torch.dtype) -> None:
             self.register_buffer(name, torch.zeros(rows, *shape, dtype=dtype, device=self.device), persistent=False)
 
-        kept, self._slot = self._remembered(length)
+        kept, slot = self._remembered(length)
+        self.register_buffer("_slot", slot, persistent=False)
         for camera in self.cameras:
             buffer(f"_memory_{camera}", kept, *image, dtype=torch.uint8)
             buffer(f"_image_{camera}", *image, dtype=torch.uint8)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from worldenv_trl.metrics.classification import classification
 from worldenv_trl.metrics.drift import drift
+from worldenv_trl.metrics.groups import group_correlations
 from worldenv_trl.metrics.success import paired_test
 
 __all__ = ["advantage_correlation", "honesty", "rank_correlation"]
@@ -76,10 +77,7 @@ def honesty(
 
 
 def advantage_correlation(returns: Any, real: Any) -> tuple[float, int]:
-    """How much of what a group learns from is so: the correlation, within groups, of imagined returns and real success.
-
-    A leave-one-out advantage compares the rollouts of one context with each other; the difference between contexts,
-    which makes precision and recall look good, is no part of it.
+    """How much of what a group learns from is so: the mean of :func:`~worldenv_trl.metrics.group_correlations`.
 
     Args:
         returns: ``[G, N]`` of N imagined rollouts of each of G contexts.
@@ -95,10 +93,8 @@ def advantage_correlation(returns: Any, real: Any) -> tuple[float, int]:
     returns, real = torch.as_tensor(returns).double(), torch.as_tensor(real).double()
     if returns.shape != real.shape or returns.ndim != 2:
         raise ValueError(f"returns and real must both be [G, N], got {list(returns.shape)} and {list(real.shape)}")
-    x, y = returns - returns.mean(1, keepdim=True), real - real.mean(1, keepdim=True)
-    mixed = y.square().sum(1) > 0
-    scale = (x.square().sum(1) * y.square().sum(1)).sqrt().clamp_min(1e-12)
-    return ((x * y).sum(1) / scale)[mixed].mean().item(), int(mixed.sum())
+    each = group_correlations(returns, real)
+    return each.nanmean().item(), int(each.isfinite().sum())
 
 
 def rank_correlation(first: Any, second: Any) -> float:

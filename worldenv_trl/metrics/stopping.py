@@ -10,7 +10,15 @@ from torch import Tensor
 from worldenv_trl.metrics.classification import classification
 from worldenv_trl.reflectors import StopRule
 
-__all__ = ["choose_rule", "first_success", "frame_figures", "judged", "stop_figures"]
+__all__ = [
+    "choose_rule",
+    "first_success",
+    "frame_figures",
+    "judged",
+    "largest_scores",
+    "loop_returns",
+    "stop_figures",
+]
 
 _RULES = tuple(StopRule(threshold, run) for threshold in (0.5, 0.6, 0.7, 0.8, 0.9, 0.95) for run in (1, 2, 3, 4))
 
@@ -40,6 +48,36 @@ def judged(stop: Tensor, reached: Tensor, late: int = 2) -> tuple[Tensor, Tensor
     imagined = stop >= 0
     real = (reached >= 0) & (~imagined | (reached <= stop + late))
     return imagined, real
+
+
+def loop_returns(scores: Tensor, stop: Tensor, alive: Tensor) -> Tensor:
+    """The return of each rollout as LOOP takes it: R where the rule stops it or, if never, at its last frame.
+
+    What :class:`~worldenv_trl.envs.Reflect` pays along a rollout (World-Env section 3.3), on whole videos.
+
+    Args:
+        scores: [R, T + 1], R(o_1:t, g).
+        stop: int64 [R], the frame at which a row is stopped (:meth:`StopRule.first`); -1 if never.
+        alive: bool [R, T + 1], frames that belong to their episode.
+
+    Returns:
+        [R].
+
+    Examples:
+        >>> scores = torch.tensor([[0.1, 0.2, 0.9, 0.3], [0.1, 0.2, 0.3, 0.4]])
+        >>> alive = torch.tensor([[True, True, True, True], [True, True, True, False]])
+        >>> loop_returns(scores, torch.tensor([2, -1]), alive)
+        tensor([0.9000, 0.3000])
+    """
+    end = torch.where(stop >= 0, stop, alive.sum(1) - 1)
+    return scores.gather(1, end.unsqueeze(-1)).squeeze(-1)
+
+
+def largest_scores(scores: Tensor, alive: Tensor) -> Tensor:
+    """Largest of ``scores`` [R, T + 1] in each video, [R]; its first frame counts only where it is ``alive`` alone."""
+    shown = alive.clone()
+    shown[:, 0] &= alive.sum(1) == 1
+    return scores.masked_fill(~shown, -torch.inf).amax(1)
 
 
 def frame_figures(scores: Tensor, success: Tensor, alive: Tensor, threshold: float = 0.5) -> dict[str, float]:

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from worldenv_trl.keys import ACTION_DIM, CHUNK_LENGTH, STATE_DIM
-from worldenv_trl.language import Vocabulary
+from worldenv_trl.language import Vocabulary, split_words
 from worldenv_trl.policies.base import Policy
 from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.vision import PretrainedEncoder
@@ -39,7 +39,7 @@ class OFTConfig:
         dim, depth, num_heads, mlp_ratio: the transformer.
         head_dim, head_blocks: the two MLPResNet heads.
         log_scale_init: the log-scale before training.
-        max_words: longest instruction.
+        max_words: longest instruction of the training; of a longer one, the words behind are not read.
         vocabulary: words; those of the instructions when empty. Other words become ``<unk>``.
         lora_rank: of the adapters on the backbone's linear layers, 0 is none; set by
             :meth:`OFTPolicy.post_training_parameters`.
@@ -71,6 +71,9 @@ class OFTConfig:
     def __post_init__(self) -> None:
         if not self.instructions:
             raise ValueError("instructions must name at least one task's instruction, got none")
+        for text in self.instructions:
+            if len(split_words(text)) > self.max_words:
+                raise ValueError(f"max_words={self.max_words} is less than the words of the instruction {text!r}")
         if self.image_size < 16 or self.image_size % 4:
             raise ValueError(f"image_size must be a multiple of 4 px and at least 16, got {self.image_size}")
         if len(self.stem_widths) < 2 or self.depth < 1:

@@ -47,7 +47,8 @@ class Reflector(nn.Module, abc.ABC):
     Keyword Args:
         cameras: scene cameras whose frames it looks at.
         image_size: height and width of the frames (px), None for any.
-        instructions: those it is trained on; others are answered with a warning.
+        instructions: those it is trained on. One that has some calls ``self.seen.check(instructions)`` in
+            :meth:`begin`, which warns of others.
 
     Raises:
         ValueError: for no camera, or one that is named twice.

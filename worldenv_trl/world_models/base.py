@@ -47,7 +47,10 @@ class WorldModel(TensorDictModuleBase, abc.ABC):
         cameras: scene cameras that it paints, in order.
         image_size: height and width of the frames (px).
         chunk_length: C.
-        instructions: those it is trained on; others are answered with a warning.
+        instructions: those it is trained on; others are answered with a warning. Empty: it never warns.
+
+    Raises:
+        ValueError: for no camera, one that is named twice, or a size or length below 1.
 
     Examples:
         >>> class Still(WorldModel):  # remembers the last frame, and believes that nothing ever moves
@@ -81,6 +84,8 @@ class WorldModel(TensorDictModuleBase, abc.ABC):
         super().__init__()
         if not cameras or len(set(cameras)) < len(cameras):
             raise ValueError(f"cameras must name at least one camera, each once, got {tuple(cameras)}")
+        if min(image_size, chunk_length) < 1:
+            raise ValueError(f"image_size and chunk_length must be at least 1, got {image_size} and {chunk_length}")
         self.cameras, self.image_size, self.chunk_length = tuple(cameras), int(image_size), int(chunk_length)
         self.seen = SeenInstructions(f"the world model {type(self).__name__}", instructions)
         frames = [key(camera) for camera in self.cameras for key in (memory_key, reference_key)]
@@ -117,6 +122,8 @@ def request(
 ) -> TensorDict:
     """What a world model is asked for the next chunk of n videos: the only place that puts a request together.
 
+    Instructions that the model was not trained on are warned of here, whatever model it is.
+
     Args:
         world_model: says which cameras it needs, and which frames it remembers.
         recall: frames and poses of the videos so far.
@@ -131,6 +138,7 @@ def request(
         uint8 [n, 3, H, W] (the video's first frame) by camera, ``("memory", "poses")`` [n, M, 13], ``poses``
         [n, C, 13], ``padded_actions`` [n, C, 14], ``language_instruction`` and, if given, ``noise_seed`` [n, 1].
     """
+    world_model.seen.check(instructions)
     memory, first = recall(world_model.memory_indices(now)), recall(torch.zeros_like(now).unsqueeze(-1))
     out = TensorDict(batch_size=[len(now)], device=poses.device)
     for camera in world_model.cameras:

@@ -53,7 +53,6 @@ def video_loss(model: VideoWorldModel, windows: TensorDictBase) -> TensorDict:
     window, texts = Window(windows), instructions_of(windows)
     if window.steps == 0 or window.steps % length:
         raise ValueError(f"a window must hold whole chunks of {length} frames, got {window.steps} steps")
-    model.seen.check(texts)
     noise_prob = config.noise_prob
     if noise_prob is None:
         noise_prob = 0.0 if model.deterministic else 0.5

@@ -197,7 +197,6 @@ class VideoWorldModel(WorldModel, Pretrained):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._check(tensordict)
         texts, rows = instructions_of(tensordict), self.config.rows_at_once
-        self.seen.check(texts)
         shape, device = (len(texts), self.chunk_length, 3, self.image_size, self.image_size), tensordict[POSES].device
         frames = {camera: torch.empty(shape, dtype=torch.uint8, device=device) for camera in self.cameras}
         with torch.no_grad():

@@ -120,7 +120,7 @@ class _Directed(WorldModel):
 
     def __init__(self, model: WorldModel, rollouts: TensorDict, turn: int | None, reseeded: bool) -> None:
         super().__init__(cameras=model.cameras, image_size=model.image_size, chunk_length=model.chunk_length)
-        self.model = model
+        self.model, self.seen = model, model.seen  # the same warnings, in its name
         have = set(rollouts.keys(True, True))
         self._seeds = rollouts["next", NOISE_SEED] if ("next", NOISE_SEED) in have else None
         wanted = [frames_key(camera) for camera in model.cameras]

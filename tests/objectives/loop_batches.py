@@ -1,0 +1,61 @@
+"""A small stochastic actor, and ragged rollouts of it as a wave holds them."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.modules import ProbabilisticActor
+
+from worldenv_trl import keys
+from worldenv_trl.objectives import rloo_advantage
+from worldenv_trl.policies import IndependentLaplace
+
+G, N, T, C, A, OBS = 2, 3, 3, 4, 7, 5
+LENGTHS = [[9, 4, 12], [1, 6, 8]]  # executed steps: stops inside a chunk (9, 1, 6), at its end (4, 8), and never (12)
+
+
+class Heads(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.loc, self.beta = nn.Linear(OBS, C * A), nn.Linear(OBS, C * A)
+
+    def forward(self, features):
+        return self.loc(features).unflatten(-1, (C, A)), self.beta(0.2 * features).unflatten(-1, (C, A)).exp()
+
+
+def make_actor(event_dims: int = 1, seed: int = 0) -> ProbabilisticActor:
+    torch.manual_seed(seed)
+    return ProbabilisticActor(
+        TensorDictModule(Heads().double(), in_keys=["features"], out_keys=[keys.LOC, keys.SCALE]),
+        in_keys={"loc": keys.LOC, "scale": keys.SCALE},
+        out_keys=[keys.CHUNK],
+        distribution_class=IndependentLaplace,
+        distribution_kwargs={"event_dims": event_dims},
+        return_log_prob=True,
+        log_prob_key=keys.LOG_PROBS,
+    )
+
+
+def make_batch(event_dims: int = 1, spread: float = 0.15, seed: int = 8) -> TensorDict:
+    """Ragged rollouts [G, N, T] as a rollout writes them: the root's step mask belongs to the decision before."""
+    actor, generator = make_actor(event_dims), torch.Generator().manual_seed(seed)
+    features = torch.randn(G, N, T, OBS, generator=generator, dtype=torch.float64)
+    batch = TensorDict({"features": features}, [G, N, T])
+    with torch.no_grad():
+        loc, scale = actor.module[0].module(features)
+        noise = torch.rand(loc.shape, generator=generator, dtype=torch.float64) - 0.5
+        chunk = loc - scale * noise.sign() * torch.log1p(-2 * noise.abs())
+        log_probs = IndependentLaplace(loc, scale, event_dims).log_prob(chunk)
+    batch[keys.CHUNK] = chunk
+    shift = spread * torch.randn(log_probs.shape, generator=generator, dtype=torch.float64)
+    batch[keys.LOG_PROBS] = log_probs + shift
+    steps = torch.arange(T * C).view(T, C) < torch.tensor(LENGTHS)[..., None, None]
+    batch["next"] = TensorDict({keys.STEP_MASK: steps}, [G, N, T])
+    batch[keys.STEP_MASK] = torch.cat([torch.zeros_like(steps[:, :, :1]), steps[:, :, :-1]], 2)
+    batch[keys.MASK] = steps.any(-1)
+    returns = torch.rand(G, N, generator=generator, dtype=torch.float64)
+    batch["returns"] = returns[..., None].expand(G, N, T).clone()
+    batch[keys.ADVANTAGE] = rloo_advantage(returns)[..., None, None].expand(G, N, T, 1).clone()
+    return batch

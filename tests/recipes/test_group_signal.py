@@ -1,0 +1,157 @@
+"""Groups in the physics, and what imagination tells of them, at the smallest scale."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from test_benchmarks import benchmark
+
+from direct_predictor import fit_direct
+from group_views import AHEAD, DIRECT, FIGURES, IMAGINED, REAL, Judge, curve, views
+from parts import make_policy, make_reflector, make_world_model
+from real_groups import Draw, RealGroups, real_groups
+from run import Run, write_rules
+from run_folder import RunFolder
+from worldenv_trl.envs import context_id
+from worldenv_trl.metrics import group_correlations
+from worldenv_trl.record import read_rollouts
+from worldenv_trl.reflectors import Reflector, StopRule
+
+DRAW = Draw(contexts=4, group_size=2, scale_factor=1.0, seed=0)
+
+
+@pytest.fixture
+def run(tiny):
+    """A run of two tasks with untrained parts."""
+    import config
+
+    settings = dataclasses.replace(tiny, tasks=config.GOAL_TASKS[1:], world_model=config.WorldModel(width=16))
+    run = Run(settings, RunFolder(settings.run_dir))
+    run.folder.open(settings)
+    torch.manual_seed(0)
+    parts = {"sft": make_policy, "world_model": make_world_model, "reflector": make_reflector}
+    for name, make in parts.items():
+        make(settings).save_pretrained(run.folder.checkpoint(name))
+    write_rules(run.folder.checkpoint("reflector"), {"real": StopRule(), "imagined": StopRule()})
+    return run
+
+
+def command(run, **settings):
+    signal = benchmark("group_signal")
+    defaults = {"contexts": 4, "group_size": 2, "resamples": 20}
+    return signal.main(signal.Settings(run.folder.path, **defaults | settings))
+
+
+def with_outcomes(groups: RealGroups, reached: list[int]) -> RealGroups:
+    """The same rollouts, reaching the goal at these frames; -1 never."""
+    frames = torch.arange(groups.episodes["success"].shape[1])
+    groups.episodes["success"] = torch.stack([(frames >= first) & (first >= 0) for first in reached])
+    return groups
+
+
+def test_groups_are_drawn_once_and_share_their_initial_states(run, tmp_path):
+    policy = run.policy("sft")
+    groups = real_groups(run, policy, DRAW, tmp_path / "groups")
+    assert groups.task_id.tolist() == [0, 0, 1, 1] and groups.success.shape == (4, 2)
+    ids = [context_id(task, "train", index) for task in (0, 1) for index in (0, 3)]
+    assert groups.context_id.tolist() == ids
+    states, actions = groups.grouped(groups.episodes["states"]), groups.grouped(groups.episodes["actions"])
+    assert (states[:, 0, 0] == states[:, 1, 0]).all() and (actions[:, 0] != actions[:, 1]).any((1, 2)).all()
+    assert (groups.episodes["length"] == run.config.max_steps).all()  # nothing but the step limit ends them
+    recording = tmp_path / "groups" / "groups.mcap"
+    before = recording.stat().st_mtime_ns
+    again = real_groups(run, policy, DRAW, tmp_path / "groups")
+    assert recording.stat().st_mtime_ns == before and (again.episodes.entries == groups.episodes.entries).all()
+    assert len(read_rollouts(recording)) == 8
+    for other in (dataclasses.replace(DRAW, seed=1), dataclasses.replace(DRAW, contexts=2)):
+        with pytest.raises(ValueError, match=r"were drawn with another (seed|contexts)"):
+            real_groups(run, policy, other, tmp_path / "groups")
+    with pytest.raises(ValueError, match="were drawn with another policy"):
+        real_groups(run, make_policy(run.config), DRAW, tmp_path / "groups")
+
+
+class FirstPixel(Reflector):
+    """R is the red of a frame's first pixel."""
+
+    def begin(self, frames, instructions):
+        score = frames["agentview"][:, 0, 0, 0].float() / 255
+        return TensorDict({"score": score}, batch_size=[len(score)])
+
+    def extend(self, state, frames):
+        scores = frames["agentview"][:, :, 0, 0, 0].float() / 255
+        return TensorDict({"score": scores[:, -1]}, batch_size=[len(scores)]), scores
+
+
+def test_views_hold_returns_of_the_reflector_and_success_of_the_physics(run, tmp_path):
+    groups = with_outcomes(real_groups(run, run.policy("sft"), DRAW, tmp_path), [3, -1, -1, -1, 5, 6, -1, 9])
+    assert groups.mixed.tolist() == [True, False, False, True]
+    judge = Judge(FirstPixel(), {"real": StopRule(0.99, 1), "imagined": StopRule(0.01, 2)})
+    seen, ahead = views(judge, run.world_model(), run.kinematics, groups)
+    assert list(seen) == [REAL, AHEAD, IMAGINED]
+    last = groups.episodes.frames("agentview", torch.arange(8), torch.tensor(run.config.max_steps))[:, 0, 0, 0] / 255
+    assert not seen[REAL].stopped.any() and torch.equal(seen[REAL].returns.flatten(), last)
+    assert torch.equal(seen[REAL].done, groups.success)
+    assert seen[IMAGINED].correlations.isfinite().tolist() == groups.mixed.tolist()
+    later = curve(judge, run.world_model(), run.kinematics, groups, (seen[AHEAD], ahead), (1, 2))
+    for shown, view in ((1, seen[IMAGINED]), (2, seen[AHEAD])):  # two chunks are all
+        expected = group_correlations(view.returns, groups.success)
+        assert torch.allclose(later[shown], expected, equal_nan=True)
+
+
+def test_the_command_leaves_its_figures(run, capsys):
+    out = command(run)
+    report = json.loads(out.read_text())
+    assert out == run.folder.path / "signal" / "sft" / "world_model-reflector.json"
+    assert report["groups"]["all"]["groups"] == 4 and list(report["views"]) == [REAL, AHEAD, IMAGINED]
+    assert list(report["views"][IMAGINED]) == list(report["curve"]) == ["all", *run.config.tasks]
+    assert list(report["views"][REAL]["all"]) == list(FIGURES) and list(report["curve"]["all"]) == ["1", "2"]
+    assert "| real frames | all |" in (shown := capsys.readouterr().out) and "calibration error" in shown
+    other = shutil.copytree(run.folder.checkpoint("world_model"), run.folder.path / "elsewhere")
+    again = command(run, against=out, world_model=str(other))
+    assert again == out.with_name(f"elsewhere_{report['models']['world_model']['hash'][:8]}-reflector.json")
+    assert set(json.loads(again.read_text())["gain"]) == {"all", *run.config.tasks}
+
+
+def test_what_needs_no_video_learns_from_the_exploration(run, monkeypatch):
+    with pytest.raises(SystemExit, match=r"demonstrations.mcap does not exist: run the stage 'demonstrate'"):
+        command(run, direct=True)
+    command(run)
+    for name in ("demonstrations", "explore"):
+        shutil.copy(run.folder.path / "signal" / "sft" / "groups.mcap", run.folder.rollouts(name))
+    monkeypatch.setattr("group_views.fit_direct", partial(fit_direct, steps=2))
+    views = json.loads(command(run, direct=True).read_text())["views"]
+    assert list(views) == [REAL, AHEAD, IMAGINED, DIRECT]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"contexts": 3}, "contexts must be a multiple of the run's 2 tasks, got 3"),
+        ({"contexts": 10}, "contexts must be at most 8"),
+        ({"group_size": 1}, "group_size must be at least 2, got 1"),
+        ({"scale_factor": 0.0}, "scale_factor must be positive, got 0.0"),
+        ({"shown_chunks": (1,)}, "--shown-chunks must be at least 2, got 1"),
+        ({"resamples": 0}, "--resamples must be at least 1, got 0"),
+        ({"policy": "post_train"}, "post_train does not exist"),
+        ({"world_model": "world_model_2"}, "world_model_2 does not exist: run the stage 'train_world_model'"),
+        ({"reflector": "world_model"}, "holds a VideoWorldModel, not a CompactReflector"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_before_anything_is_drawn(settings, message, run):
+    with pytest.raises(SystemExit, match=f"^error: .*{message}"):
+        command(run, **settings)
+    assert not (run.folder.path / "signal").exists()
+
+
+def test_a_folder_that_is_no_run_or_no_report_is_refused(run, tmp_path):
+    with pytest.raises(SystemExit, match="is no run folder"):
+        benchmark("group_signal").main(benchmark("group_signal").Settings(tmp_path))
+    (tmp_path / "other.json").write_text("{}")
+    with pytest.raises(SystemExit, match="holds no figures of group_signal"):
+        command(run, against=tmp_path / "other.json")
