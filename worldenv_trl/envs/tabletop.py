@@ -62,8 +62,8 @@ class _Block:
 class TabletopEnv(EnvBase):
     """``num_envs`` copies of one or several tasks, stepped and rendered together. Batch-locked; honours ``_step``.
 
-    A row's episode is a function of (seed, number of the episode, actions), bit for bit, whatever the batch and the
-    threads: the states that a batch of 16 draws in one reset are those that one row draws in 16 resets. A row whose
+    A row's episode is a function of (seed, number of the episode, actions, what a ``context_sampler`` was told), bit for
+    bit, whatever the batch and the threads: the states that a batch of 16 draws in one reset are those that one row draws in 16 resets. A row whose
     physics blows up is truncated, with a warning that says how to see it again; the others do not notice. A row that
     has ended reports its end until it is reset, whether it is stepped or not.
 
@@ -78,13 +78,11 @@ class TabletopEnv(EnvBase):
             ``("observation", "image")``, ``wrist`` to ``("observation", "wrist_image")``, any other to
             ``("observation", its name)``; an empty tuple renders nothing.
         init_split: ``train`` or ``test``.
-        init_state_mode: ``random`` (shuffled passes), ``cycle`` (in order, reset after reset, so that every state gets
-            its turn) or ``fixed``.
+        init_state_mode: ``random`` (shuffled passes), ``cycle`` (in order, reset after reset) or ``fixed``.
         init_state_id: the fixed state, or where the cycle starts.
         init_state_count: how many states of the split take part, at most 50,000; 50 is the standard protocol.
         init_states: float64 [K, S] to use instead of the split's (one task only), with their ``context_ids`` [K].
-        context_sampler: draws the states of each task by how mixed the groups that started from them were, in place of
-            the shuffled passes of ``random``; episodes then follow from what it was told, too.
+        context_sampler: draws a task's states by how mixed their groups were, instead of in shuffled passes.
         group_repeats: that many consecutive rows share one initial state (the rollouts of an RLOO group).
         terminate_on_success: end a row when its goal holds; reward is 1 on that step, else 0. When False, a row runs to
             ``max_steps`` and reward is the success of each step.
@@ -105,8 +103,7 @@ class TabletopEnv(EnvBase):
 
     Raises:
         TypeError: naming the argument that is of another kind.
-        ValueError: naming the unknown task, camera, split or mode, the size out of bounds, or what is wrong with the
-            given states.
+        ValueError: naming the unknown task, camera, split or mode, the size out of bounds, or the wrong states.
         RuntimeError: if images are asked for and no GL backend works; from ``reset`` and ``step`` of a closed env.
 
     Examples:
