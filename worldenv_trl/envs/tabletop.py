@@ -62,8 +62,8 @@ class _Block:
 class TabletopEnv(EnvBase):
     """``num_envs`` copies of one or several tasks, stepped and rendered together. Batch-locked; honours ``_step``.
 
-    A row's episode is a function of (seed, number of the episode, actions, what a ``context_sampler`` was told), bit for
-    bit, whatever the batch and the threads: the states that a batch of 16 draws in one reset are those that one row draws in 16 resets. A row whose
+    A row's episode is a function of (seed, number of the episode, actions, what a ``context_sampler`` was told), bit
+    for bit, whatever the batch and the threads: a batch of 16 draws in one reset what one row draws in 16. A row whose
     physics blows up is truncated, with a warning that says how to see it again; the others do not notice. A row that
     has ended reports its end until it is reset, whether it is stepped or not.
 
