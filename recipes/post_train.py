@@ -1,4 +1,4 @@
-"""LOOP (World-Env Algorithm 1): rollouts, leave-one-out advantages, clipped updates of adapters and heads.
+"""LOOP (World-Env Algorithm 1): rollouts, leave-one-out advantages, clipped updates of adapters and heads, or all.
 
 ``env="imagined"`` learns in the world model, ``env="tabletop"`` in the physics (the upper bound); nothing else changes.
 Alone: ``python recipes/post_train.py improve --run-dir runs/improve``.
