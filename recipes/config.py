@@ -202,15 +202,14 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
         ),
     ),
     "improve": (
-        "Meant to raise held-out success (README: how far it does), in about 50 minutes on 2 cores; extra vision.",
+        "Meant to raise held-out success (README: how far it does), in at most 60 minutes on 2 cores; extra vision.",
         WorldEnvConfig(
             run_dir=Path("runs/improve"),
             train_states=150,
             sft=SFT(vision_blocks=(2, 4, 10)),
             explore=Explore(episodes_per_task=480),
             reflector=Reflector(choose_threshold=True),
-            # More iterations are exploited (recipes/RESULTS.md, "With pretrained eyes").
-            post_train=PostTrain(iterations=12, lora_rank=0),
+            post_train=PostTrain(iterations=40),
         ),
     ),
 }

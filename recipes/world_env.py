@@ -3,7 +3,7 @@
 From five demonstrations per task to a policy post-trained by reinforcement learning inside a learned world model::
 
     python recipes/world_env.py smoke      # every stage for real, at most 6 minutes on 2 cores
-    python recipes/world_env.py improve    # meant to raise held-out success: about 50 minutes on 2 cores; extra vision
+    python recipes/world_env.py improve    # meant to raise held-out success: at most 60 minutes; extra vision
     python recipes/world_env.py improve --help
 
 The same command continues an interrupted run: finished stages are skipped, the running one starts again.
