@@ -15,6 +15,7 @@ from worldenv_trl.language import split_words
 from worldenv_trl.policies import OFTConfig, OFTPolicy, Policy
 from worldenv_trl.reflectors import CompactLessons, CompactReflector, CompactReflectorConfig, Reflector
 from worldenv_trl.scenes import load_task
+from worldenv_trl.vision import load_vision
 from worldenv_trl.world_models import VideoWorldModel, VideoWorldModelConfig, WorldModel
 
 PROPRIO = "commanded"  # the same in physics and imagination, so the policy meets no gap between them
@@ -61,7 +62,7 @@ def make_policy(config: WorldEnvConfig) -> OFTPolicy:
         )
     )
     if settings.vision_blocks:
-        policy.load_vision(config.vision_weights)
+        load_vision(policy, config.vision_weights)
     return policy
 
 
@@ -100,7 +101,7 @@ def make_reflector(config: WorldEnvConfig) -> CompactReflector:
         ),
     )
     if settings.vision_blocks:
-        reflector.load_vision(config.vision_weights)
+        load_vision(reflector, config.vision_weights)
     return reflector
 
 

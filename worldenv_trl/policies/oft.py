@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -34,7 +33,7 @@ class OFTConfig:
         stem_widths: channels of the stem's convolutions, at least two; the first two halve the image.
         num_keypoints: tokens of each image.
         vision_blocks: blocks of a frozen :class:`~worldenv_trl.vision.PretrainedEncoder` whose features join the
-            stem's; none when empty. :meth:`OFTPolicy.load_vision` brings its weights.
+            stem's; none when empty. :func:`~worldenv_trl.vision.load_vision` brings its weights.
         vision_width: channels that these features become.
         dim, depth, num_heads, mlp_ratio: the transformer.
         head_dim, head_blocks: the two MLPResNet heads.
@@ -324,18 +323,6 @@ class OFTPolicy(Policy, Pretrained):
             low, high = torch.quantile(flat, torch.tensor([0.01, 0.99]).to(flat), dim=0)
             center.copy_((low + high) / 2)
             half_range.copy_(((high - low) / 2).clamp(min=floor))
-
-    def load_vision(self, weights: str | os.PathLike | None = None) -> None:
-        """Gives the frozen encoder its ImageNet weights: :meth:`~worldenv_trl.vision.PretrainedEncoder.load_published`.
-
-        Raises:
-            ValueError: for a policy without ``vision_blocks``.
-        """
-        if self.backbone.vision is None:
-            raise ValueError(
-                "this policy has no pretrained encoder: build it with vision_blocks, for instance (2, 4, 10)"
-            )
-        self.backbone.vision.load_published(weights)
 
     def scale_parameters(self) -> list[nn.Parameter]:
         return list(self.scale_head.parameters())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -42,7 +41,7 @@ class CompactReflectorConfig:
         hidden_dim: of the reward head.
         num_frames: most frames of a prefix that are looked at.
         vision_blocks: blocks of a frozen :class:`~worldenv_trl.vision.PretrainedEncoder` that the encoder sees
-            through, too; none when empty. :meth:`CompactReflector.load_vision` brings its weights.
+            through, too; none when empty. :func:`~worldenv_trl.vision.load_vision` brings its weights.
 
     Raises:
         ValueError: for no instruction, or sizes out of range.
@@ -101,18 +100,6 @@ class CompactReflector(Reflector, Pretrained):
         self.key = nn.Linear(dim, dim, bias=False)  # a bias would add the same to all frames of a prefix
         self.age = nn.Parameter(torch.zeros(config.num_frames))
         self.head = nn.Sequential(nn.LayerNorm(6 * dim), nn.Linear(6 * dim, hidden), nn.GELU(), nn.Linear(hidden, 1))
-
-    def load_vision(self, weights: str | os.PathLike | None = None) -> None:
-        """Gives the frozen encoder its ImageNet weights: :meth:`~worldenv_trl.vision.PretrainedEncoder.load_published`.
-
-        Raises:
-            ValueError: for a reflector without ``vision_blocks``.
-        """
-        if self.encoder.vision is None:
-            raise ValueError(
-                "this reflector has no pretrained encoder: build it with vision_blocks, for instance (4, 10)"
-            )
-        self.encoder.vision.load_published(weights)
 
     # ------------------------------------------------------------------------------------------------- judging
 

