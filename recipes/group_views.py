@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from direct_predictor import fit_direct, predict_direct
 from real_groups import RealGroups
+from run import LATE
 from worldenv_trl.data import Episodes, imagine_episodes, score_episodes
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.metrics import (
@@ -32,11 +33,10 @@ from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.world_models import WorldModel
 
 REAL, AHEAD, IMAGINED, DIRECT = "real frames", "one chunk ahead", "imagined", "no video"
-LATE = 2  # frames by which the goal may be reached after a stop in imagination, whose time is not exact
 
 
 @dataclass(frozen=True)
-class Judge:
+class RuledReflector:
     """A reflector, and when it stops ``imagined`` and ``real`` rollouts."""
 
     reflector: Reflector
@@ -88,11 +88,12 @@ FIGURES: dict[str, tuple[Callable[[Tensor, Tensor], Tensor], str, str]] = {
 """Each of two entries of a :class:`View`, [*B, G, N] -> [*B]."""
 
 
-def view(judge: Judge, groups: RealGroups, episodes: Episodes, real: bool = False) -> View:
+def view(judge: RuledReflector, groups: RealGroups, episodes: Episodes, real: bool = False) -> View:
     """What is said of ``episodes``, the groups' own (``real``) or what was imagined of them."""
     scores, alive = score_episodes(judge.reflector, episodes), episodes.alive
-    stop = judge.rules["real" if real else "imagined"].first(scores, alive)
-    stopped, done = judged(stop, groups.reached, 0 if real else LATE)
+    world = "real" if real else "imagined"
+    stop = judge.rules[world].first(scores, alive)
+    stopped, done = judged(stop, groups.reached, LATE[world])
     return View(
         returns=groups.grouped(loop_returns(scores, stop, alive)),
         largest=groups.grouped(largest_scores(scores, alive)),
@@ -124,7 +125,7 @@ def mean_correlation(correlations: Tensor, task_id: Tensor, rows: Tensor, resamp
 
 
 def views(
-    judge: Judge, world_model: WorldModel, kinematics: ForwardKinematics, groups: RealGroups
+    judge: RuledReflector, world_model: WorldModel, kinematics: ForwardKinematics, groups: RealGroups
 ) -> tuple[dict[str, View], Episodes]:
     """:data:`REAL`: what the reflector can tell; :data:`AHEAD`: every chunk imagined from real memory; and
     :data:`IMAGINED`: open loop. Also the episodes one chunk ahead [G * N], for :func:`curve`."""
@@ -148,7 +149,7 @@ def direct_view(explored: Episodes, kinematics: ForwardKinematics, groups: RealG
 
 
 def curve(
-    judge: Judge,
+    judge: RuledReflector,
     world_model: WorldModel,
     kinematics: ForwardKinematics,
     groups: RealGroups,

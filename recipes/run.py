@@ -18,6 +18,8 @@ from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.world_models import WorldModel
 
 RULES = "stop_rules.json"
+# Frames by which the goal may come after the stop: imagined time is not exact, in front of a camera the stop is final.
+LATE = {"real": 0, "imagined": 2}
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import torch
 from tqdm import trange
 
 from episodes import demonstrations_and_exploration, split_by_context
-from run import Run, write_rules
+from run import LATE, Run, write_rules
 from stages import run_alone
 from worldenv_trl import keys
 from worldenv_trl.data import Episodes, imagine_episodes, score_episodes
@@ -22,9 +22,6 @@ from worldenv_trl.metrics import choose_rule, frame_figures, stop_figures
 from worldenv_trl.objectives import ReflectorLoss
 from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.reflectors import Reflector, StopRule
-
-# Frames by which the goal may come after the stop: imagined time is not exact, in front of a camera the stop is final.
-LATE = {"real": 0, "imagined": 2}
 
 
 def train_reflector(run: Run, target: str = "reflector", models: str = "", rounds: int = 1) -> None:

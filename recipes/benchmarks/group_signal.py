@@ -38,7 +38,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from command_line import at_least, refusals
 from episodes import demonstrations_and_exploration
 from gather_evidence import read_config
-from group_views import AHEAD, DIRECT, FIGURES, IMAGINED, Judge, curve, direct_view, figures, mean_correlation, views
+from group_views import (
+    AHEAD,
+    DIRECT,
+    FIGURES,
+    IMAGINED,
+    RuledReflector,
+    curve,
+    direct_view,
+    figures,
+    mean_correlation,
+    views,
+)
 from real_groups import Draw, RealGroups, check_draw, real_groups
 from run import Run, read_rules
 from run_folder import RunFolder
@@ -103,7 +114,7 @@ def main(settings: Settings) -> Path:
         }
         policy = run.parts.policy.load(paths["policy"])
         world_model = run.parts.world_model.load(paths["world_model"]).eval()
-        judge = Judge(run.parts.reflector.load(paths["reflector"]).eval(), read_rules(paths["reflector"]))
+        judge = RuledReflector(run.parts.reflector.load(paths["reflector"]).eval(), read_rules(paths["reflector"]))
         explored = demonstrations_and_exploration(run, 1)[1] if settings.direct else None
         before = None if settings.against is None else read_report(settings.against)
         folder = settings.groups or settings.run / "signal" / paths["policy"].name
@@ -172,7 +183,7 @@ def measure(
     run: Run,
     groups: RealGroups,
     world_model: WorldModel,
-    judge: Judge,
+    judge: RuledReflector,
     settings: Settings,
     explored: Episodes | None = None,
     before: dict[str, Any] | None = None,

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from test_benchmarks import benchmark
 
 from direct_predictor import fit_direct
-from group_views import AHEAD, DIRECT, FIGURES, IMAGINED, REAL, Judge, curve, views
+from group_views import AHEAD, DIRECT, FIGURES, IMAGINED, REAL, RuledReflector, curve, views
 from parts import make_policy, make_reflector, make_world_model
 from real_groups import Draw, RealGroups, real_groups
 from run import Run, write_rules
@@ -91,7 +91,7 @@ class FirstPixel(Reflector):
 def test_views_hold_returns_of_the_reflector_and_success_of_the_physics(run, tmp_path):
     groups = with_outcomes(real_groups(run, run.policy("sft"), DRAW, tmp_path), [3, -1, -1, -1, 5, 6, -1, 9])
     assert groups.mixed.tolist() == [True, False, False, True]
-    judge = Judge(FirstPixel(), {"real": StopRule(0.99, 1), "imagined": StopRule(0.01, 2)})
+    judge = RuledReflector(FirstPixel(), {"real": StopRule(0.99, 1), "imagined": StopRule(0.01, 2)})
     seen, ahead = views(judge, run.world_model(), run.kinematics, groups)
     assert list(seen) == [REAL, AHEAD, IMAGINED]
     last = groups.episodes.frames("agentview", torch.arange(8), torch.tensor(run.config.max_steps))[:, 0, 0, 0] / 255
