@@ -20,7 +20,7 @@ from worldenv_trl.record import RolloutWriter
 def demonstrate(run: Run) -> None:
     """Writes ``rollouts/demonstrations.mcap``; raises ``RuntimeError`` if the expert fails one."""
     config, folder = run.config, run.folder
-    run.seed_everything(offset=0)
+    run.seed_everything("demonstrate")
     count = config.demonstrate.episodes_per_task
     options = {"init_state_mode": "cycle", "terminate_on_success": True, "with_sim_state": True}
     described = tabletop(config, "train", len(config.tasks), None, **options)

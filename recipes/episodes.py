@@ -32,7 +32,11 @@ def demonstrations_and_exploration(run: Run, rounds: int) -> tuple[Episodes, Epi
 
 
 def split_by_context(episodes: Episodes, share: float, seed: int) -> tuple[Episodes, Episodes]:
-    """Episodes for training, and those of a ``share`` of the initial states (at least one) for figures."""
+    """Episodes for training, and those of a ``share`` of the initial states (at least one) for figures.
+
+    One ``seed`` for all rounds and both models: a later round must not show what an earlier one was trained on, and the
+    states of the smaller share are among those of the larger.
+    """
     contexts = episodes[keys.CONTEXT_ID].squeeze(-1)
     distinct = contexts.unique()
     order = torch.randperm(len(distinct), generator=torch.Generator().manual_seed(seed))

@@ -25,7 +25,7 @@ def evaluate(run: Run, before: str, after: str, models: str | None) -> None:
     Without ``models`` there is no reflector, and its protocol is left out.
     """
     config, folder = run.config, run.folder
-    run.seed_everything(offset=90)
+    run.seed_everything("evaluate")
     reflector = None if models is None else Judge(run.reflector(models), run.rules(models)["real"])
     for protocol in ("physics",) if reflector is None else ("physics", "reflector"):
         outcomes: dict[str, dict[str, torch.Tensor]] = {}

@@ -20,7 +20,7 @@ from worldenv_trl.record import RolloutWriter
 def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
     """Rolls checkpoint ``policy`` on the training initial states; writes ``rollouts/<target>.mcap``."""
     config, folder, settings = run.config, run.folder, run.config.explore
-    run.seed_everything(offset=20 + len(target))
+    run.seed_everything(target)
     model = run.policy(policy).eval()
     per_scale = -(-settings.episodes_per_task * len(config.tasks) // len(settings.scale_factors))
     waves = -(-per_scale // settings.num_envs)
@@ -28,7 +28,7 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
     options: dict[str, Any] = {
         "terminate_on_success": False,
         "with_sim_state": True,
-        "seed": config.seed + 1000 * len(target),
+        "seed": run.seed(target, "initial states"),
     }
     env = step_env(config, "train", settings.num_envs, **options)
     about = recording(config, env, target, {"policy": model}, policy=policy)

@@ -42,6 +42,7 @@ class Imagination:
         batch_size: Sequence[int],
         contexts: TensorDict | None = None,
         *,
+        seed: int,
         sampler: ContextSampler | None = None,
     ) -> TransformedEnv:
         """FK, action map, world model; the reflector gives the reward and stops; frames are not carried along."""
@@ -52,7 +53,7 @@ class Imagination:
             batch_size=list(batch_size),
             max_steps=run.config.max_steps,
             proprio=PROPRIO,
-            seed=run.config.seed,
+            seed=seed,
             context_sampler=sampler,
         )
         return TransformedEnv(env, Compose(Reflect(self.reflector, self.rule), FramesAside(run.folder.path)))

@@ -95,7 +95,8 @@ def imagined_outcomes(
     run: Run, actor: TensorDictModuleBase, imagination: Imagination, contexts: TensorDict
 ) -> torch.Tensor:
     """Whether the reflector stops the greedy policy in imagination, bool ``[K]``, for each context in order."""
-    env = imagination.env(run, [len(contexts), 1], contexts)
+    # The same noise for every policy: probes are compared with one another.
+    env = imagination.env(run, [len(contexts), 1], contexts, seed=run.seed("probe"))
     collector = GroupCollector(
         env,
         actor,

@@ -11,6 +11,7 @@ from torchrl.modules import MultiStepActorWrapper
 
 from config import WorldEnvConfig
 from parts import PROPRIO
+from seeds import stage_seed
 from worldenv_trl.envs import ContextSampler, TabletopEnv, chunked
 from worldenv_trl.policies import LaplaceActor, Policy, laplace_actor, scale_bounds
 from worldenv_trl.record import provenance
@@ -19,9 +20,16 @@ from worldenv_trl.record import provenance
 def tabletop(
     config: WorldEnvConfig, split: str, num_envs: int, tasks: Sequence[str] | None, **options: Any
 ) -> TabletopEnv:
-    """Some of the run's tasks (all by default), each under its number in the run."""
+    """Some of the run's tasks (all by default), each under its number in the run.
+
+    Stages whose initial states come in a random order give a ``seed`` of their own.
+    """
     tasks = list(config.tasks if tasks is None else tasks)
-    options = {"seed": config.seed, "num_threads": config.num_threads, "cameras": config.cameras} | options
+    options = {
+        "seed": stage_seed(config.seed, "tabletop"),
+        "num_threads": config.num_threads,
+        "cameras": config.cameras,
+    } | options
     if split == "train":
         options = {"init_state_count": config.train_states} | options
     return TabletopEnv(
@@ -44,10 +52,10 @@ def step_env(
 
 
 def physics_waves_env(
-    config: WorldEnvConfig, groups: int, group_size: int, *, sampler: ContextSampler | None = None
+    config: WorldEnvConfig, groups: int, group_size: int, *, sampler: ContextSampler | None = None, **more: Any
 ) -> EnvBase:
     """Physics, one chunk a step, rows in groups that share an initial state: LOOP's upper bound."""
-    options = {"group_repeats": group_size, "with_sim_state": True, "context_sampler": sampler}
+    options = {"group_repeats": group_size, "with_sim_state": True, "context_sampler": sampler} | more
     return chunked(tabletop(config, "train", groups * group_size, None, **options), config.chunk_length)
 
 

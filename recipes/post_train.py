@@ -52,7 +52,7 @@ def post_train(
             that would be saved now, which it must leave as it is, like torch's random numbers.
     """
     config, settings = run.config, run.config.post_train
-    run.seed_everything(offset=50)
+    run.seed_everything(target)
     policy = run.policy(source)
     groups = policy.post_training_parameters(settings.lora_rank)
     actor = exploring_actor(config, policy, settings.scale_factor)
@@ -61,10 +61,11 @@ def post_train(
     shape = [settings.groups, settings.group_size]
     if settings.env == "imagined":
         imagination = Imagination.load(run, models)
-        env = imagination.env(run, shape, sampler=sampler)
+        env = imagination.env(run, shape, seed=run.seed(target, "env"), sampler=sampler)
         judges = {"world_model": imagination.world_model, "reflector": imagination.reflector}
     else:
-        imagination, env, judges = None, physics_waves_env(config, *shape, sampler=sampler), {}
+        imagination, judges = None, {}
+        env = physics_waves_env(config, *shape, seed=run.seed(target, "env"), sampler=sampler)
     collector = GroupCollector(
         env,
         actor,

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from physics import chunk_player, exploring_actor, recording, step_env
 from run import Run
+from seeds import stage_seed
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.data import Episodes, fill_store, open_store
@@ -137,7 +138,7 @@ def _check_same(run: Run, policy: Policy, draw: Draw, path: Path) -> None:
 def _live(run: Run, policy: Policy, draw: Draw, path: Path) -> None:
     """Draws the groups: LOOP's behaviour policy, in the physics."""
     config = run.config
-    torch.manual_seed(1000 * draw.seed + 60)
+    torch.manual_seed(stage_seed(draw.seed, "groups"))
     player = chunk_player(exploring_actor(config, policy.eval(), draw.scale_factor), config.chunk_length)
     per_task, at_once = draw.contexts // len(config.tasks), max(1, _ROWS // draw.group_size)
     # Spread over all states: the first ones are the demonstrations' own.

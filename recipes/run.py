@@ -12,6 +12,7 @@ import torch
 from config import WorldEnvConfig
 from parts import COMPACT, Parts
 from run_folder import RunFolder
+from seeds import stage_seed
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.policies import Policy
 from worldenv_trl.reflectors import Reflector, StopRule
@@ -32,9 +33,13 @@ class Run:
     def kinematics(self) -> ForwardKinematics:
         return self.parts.kinematics()
 
-    def seed_everything(self, offset: int) -> None:
+    def seed(self, stage: str, use: str = "") -> int:
+        """Of one use of random numbers in a stage; see :func:`seeds.stage_seed`."""
+        return stage_seed(self.config.seed, stage, use)
+
+    def seed_everything(self, stage: str) -> None:
         """Each stage has its own stream, so a stage run alone draws the same numbers as in the whole loop."""
-        torch.manual_seed(1000 * self.config.seed + offset)
+        torch.manual_seed(self.seed(stage))
 
     def policy(self, name: str) -> Policy:
         stage = "sft" if name == "sft" else "post_train"

@@ -26,7 +26,7 @@ from worldenv_trl.policies import laplace_actor, likelihood_actor, random_shift
 def fine_tune(run: Run) -> None:
     """Reads ``rollouts/demonstrations.mcap``, writes ``checkpoints/sft``."""
     config, settings = run.config, run.config.sft
-    run.seed_everything(offset=10)
+    run.seed_everything("sft")
     samples = policy_samples(demonstrations(run), config.chunk_length)
     policy = run.parts.policy.make(config)
     policy.fit_statistics(samples[keys.STATE], samples[keys.CHUNK])

@@ -27,22 +27,22 @@ from worldenv_trl.reflectors import Reflector, StopRule
 def train_reflector(run: Run, target: str = "reflector", models: str = "", rounds: int = 1) -> None:
     """Reads the rollouts of the first ``rounds`` rounds; writes ``checkpoints/<target>`` and its held-out figures."""
     config, settings = run.config, run.config.reflector
-    run.seed_everything(offset=40 + rounds)
+    run.seed_everything(target)
     demonstrated, explored = demonstrations_and_exploration(run, rounds)
-    training, held_out = split_by_context(explored, settings.holdout, config.seed)
+    training, held_out = split_by_context(explored, settings.holdout, run.seed("held-out contexts"))
     world_model = run.world_model(models)
     share = min(1.0, settings.imagined_share / max(1e-6, 1 - settings.imagined_share))
     chosen = torch.randperm(len(training))[: round(share * len(training))]
     with tempfile.TemporaryDirectory(dir=run.folder.path) as scratch:
 
-        def imagine(episodes: Episodes, name: str, seed: int) -> Episodes:
-            label, folder = f"{target} imagines {name}", f"{scratch}/{name}"
+        def imagine(episodes: Episodes, name: str) -> Episodes:
+            label, folder, seed = f"{target} imagines {name}", f"{scratch}/{name}", run.seed(target, f"imagines {name}")
             return imagine_episodes(world_model, episodes, run.kinematics, seed=seed, progress=label, folder=folder)
 
         episodes = [demonstrated, training]
         if len(chosen):
-            episodes.append(imagine(training[chosen], "training", config.seed))
-        imagined_held_out = imagine(held_out, "held out", config.seed + 1)
+            episodes.append(imagine(training[chosen], "training"))
+        imagined_held_out = imagine(held_out, "held out")
         reflector = run.parts.reflector.make(config)
         learn(run, reflector, Episodes.cat([part.through(world_model.cameras) for part in episodes]), target)
         reflector.eval()

@@ -26,9 +26,9 @@ HORIZONS = (1, 20, 40, 56, 60)
 def train_world_model(run: Run, target: str = "world_model", previous: str | None = None, rounds: int = 1) -> None:
     """Reads the rollouts of the first ``rounds`` rounds; writes ``checkpoints/<target>`` and its held-out fidelity."""
     config, settings = run.config, run.config.world_model
-    run.seed_everything(offset=30 + rounds)
+    run.seed_everything(target)
     demonstrated, explored = demonstrations_and_exploration(run, rounds)
-    training, held_out = split_by_context(explored, settings.holdout, config.seed)
+    training, held_out = split_by_context(explored, settings.holdout, run.seed("held-out contexts"))
     training = Episodes.cat([demonstrated, training])
     if previous is None:
         model, steps = run.parts.world_model.make(config), settings.steps
@@ -36,11 +36,11 @@ def train_world_model(run: Run, target: str = "world_model", previous: str | Non
         model, steps = run.world_model(previous.removeprefix("world_model")), settings.refit_steps
     parameters = [parameter for parameter in model.train().parameters() if parameter.requires_grad]
     if parameters:
-        options = {"failure_share": settings.failure_share, "seed": config.seed + rounds}
+        options = {"failure_share": settings.failure_share, "seed": run.seed(target, "windows")}
         windows = window_buffer(training, run.kinematics, model, batch_size=settings.batch_size, **options)
         _train(run, model, parameters, windows, steps, target)
     model.eval().save_pretrained(run.folder.checkpoint(target))
-    figures = fidelity(run, model, held_out)
+    figures = fidelity(run, model, held_out, run.seed(target, "fidelity"))
     run.folder.log(target, episodes=len(training), held_out=len(held_out), **figures)
 
 
@@ -67,14 +67,14 @@ def _train(
             progress.set_postfix(loss=f"{running:.4f}")
 
 
-def fidelity(run: Run, model: WorldModel, episodes: Episodes) -> dict[str, float]:
+def fidelity(run: Run, model: WorldModel, episodes: Episodes, seed: int) -> dict[str, float]:
     """PSNR of open-loop imagination at some horizons, on all and on moving pixels, beside copying the first frame.
 
     Figures of further cameras end in their names.
     """
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory(dir=run.folder.path) as scratch:
-        imagined = imagine_episodes(model, episodes, run.kinematics, folder=scratch)
+        imagined = imagine_episodes(model, episodes, run.kinematics, seed=seed, folder=scratch)
         for horizon in (horizon for horizon in HORIZONS if horizon <= episodes["actions"].shape[1]):
             alive = (episodes["length"].squeeze(-1) >= horizon).nonzero().squeeze(-1)
             for place, camera in enumerate(model.cameras if len(alive) else ()):

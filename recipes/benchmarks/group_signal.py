@@ -53,6 +53,7 @@ from group_views import (
 from real_groups import Draw, RealGroups, check_draw, real_groups
 from run import Run, read_rules
 from run_folder import RunFolder
+from seeds import stage_seed
 from worldenv_trl.data import Episodes
 from worldenv_trl.metrics import Estimate
 from worldenv_trl.record.mcap.provenance import model_hash
@@ -200,7 +201,7 @@ def measure(
     shown_to |= curve(judge, world_model, run.kinematics, groups, (seen[AHEAD], ahead), between)
     shown_to[chunks] = seen[AHEAD].correlations
     if explored is not None:
-        torch.manual_seed(1000 * settings.seed + 61)
+        torch.manual_seed(stage_seed(settings.seed, "direct_predictor"))
         seen[DIRECT] = direct_view(explored, run.kinematics, groups, len(run.config.tasks))
     numbers, kinds = groups.task_id, {"all": torch.ones_like(groups.task_id, dtype=torch.bool)}
     kinds |= {task: numbers == place for place, task in enumerate(run.config.tasks)}

@@ -90,7 +90,7 @@ class Measured:
         for split, indices in self.states.items():
             for mode, (actor, exploration_type) in actors.items():
                 with torch.random.fork_rng():
-                    self.run.seed_everything(offset=95)  # the same noise for every policy of the curve
+                    self.run.seed_everything("learning")  # the same noise for every policy of the curve
                     outcomes = {
                         task: physics_outcomes(
                             self.run,

@@ -104,7 +104,7 @@ def main(settings: Benchmark) -> None:
     policy, model, reflector = (part.make(config) for part in (COMPACT.policy, COMPACT.world_model, COMPACT.reflector))
     actor = laplace_actor(policy)
     timed = _Timed(model.eval())
-    env = Imagination(timed, reflector, StopRule(0.99), demonstrations[:, 0]).env(run, [8, 8])
+    env = Imagination(timed, reflector, StopRule(0.99), demonstrations[:, 0]).env(run, [8, 8], seed=0)
     collector = GroupCollector(env, actor, groups_per_batch=8)
     total, shares = [], []
     for index in range(settings.repeats + 1):

@@ -150,6 +150,14 @@ def test_noise_is_of_the_seed_the_episode_and_the_chunk():
     assert len(seeds) == 3 + 3
 
 
+def test_neighbouring_seeds_and_episodes_share_no_noise():
+    models = {seed: counting() for seed in (0, 1, 2, 1009)}
+    for seed, model in models.items():
+        imagined(model, seed=seed)
+    drawn = [asked[keys.NOISE_SEED].flatten() for model in models.values() for asked in model.requests]
+    assert len(torch.cat(drawn).unique()) == len(torch.cat(drawn)) == 4 * 3 * len(LENGTHS)
+
+
 def test_frames_on_disk_are_those_in_memory(tmp_path):
     stored = imagined(folder=tmp_path / "frames", rows_at_once=2)
     assert same(stored, imagined())

@@ -76,7 +76,7 @@ def contexts_drawn(run, contexts):
 
 
 def test_mixed_contexts_are_drawn_by_the_returns_that_are_learned_from(physics):
-    sampler, expected = ContextSampler(seed=physics.config.seed), []
+    sampler, expected = ContextSampler(seed=physics.seed("post_train", "env")), []
     for _ in range(4):
         expected.append(sampler.draw(range(4), 2))  # of one task, ids are places
         returns = torch.tensor([[1.0, float(number > 1)] for number in expected[-1]])

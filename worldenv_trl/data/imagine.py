@@ -16,6 +16,7 @@ from worldenv_trl.data.store import FrameSink
 from worldenv_trl.keys import frames_key
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.world_models import WorldModel, request
+from worldenv_trl.world_models.noise_seeds import noise_seeds
 
 __all__ = ["imagine_episodes"]
 
@@ -75,7 +76,8 @@ def imagine_episodes(
     for start in tqdm(range(0, len(episodes), rows_at_once), desc=progress, unit="batch", disable=progress is None):
         part = slice(start, start + rows_at_once)
         known = None if painted is None else painted[part]
-        video, predicted = _imagine(world_model, episodes[part], kinematics, seed + start, shown, known)
+        numbers = torch.arange(start, start + len(episodes[part]))
+        video, predicted = _imagine(world_model, episodes[part], kinematics, seed, numbers, shown, known)
         sink.add(video[episodes[part].alive])
         states.append(predicted)
     return episodes.with_video(sink.frames, kinematic_states=torch.cat(states))
@@ -86,10 +88,11 @@ def _imagine(
     episodes: Episodes,
     kinematics: ForwardKinematics,
     seed: int,
+    numbers: Tensor,
     shown: int,
     painted: Episodes | None,
 ) -> tuple[TensorDict, Tensor]:
-    """Video [R, T + 1] and kinematic states [R, T + 1, 20]."""
+    """Video [R, T + 1] and kinematic states [R, T + 1, 20] of the episodes with these ``numbers`` [R]."""
     rows, steps = episodes["actions"].shape[:2]
     length = world_model.chunk_length
     spare = -steps % length  # the last chunk may reach past the end
@@ -120,7 +123,7 @@ def _imagine(
             video["poses"][:, chunk],
             actions[:, chunk - 1],
             episodes.instructions,
-            noise_seed=(seed + row) * 1009 + start,
+            noise_seed=noise_seeds(seed, numbers, torch.full_like(numbers, start)).unsqueeze(-1),
         )
         frames = world_model(asked)
         for camera in world_model.cameras:

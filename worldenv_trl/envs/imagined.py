@@ -12,7 +12,6 @@ from torchrl.envs import EnvBase
 from worldenv_trl.envs.context_sampler import ContextSampler
 from worldenv_trl.envs.contexts import ContextOrder, check_contexts, context_keys
 from worldenv_trl.envs.imagined_specs import imagined_specs
-from worldenv_trl.envs.noise_seeds import noise_seeds
 from worldenv_trl.keys import (
     ACTION_DIM,
     CHUNK,
@@ -37,6 +36,7 @@ from worldenv_trl.keys import (
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.language import instructions_of
 from worldenv_trl.world_models import WorldModel, request
+from worldenv_trl.world_models.noise_seeds import noise_seeds
 
 __all__ = ["ImaginedEnv"]
 
