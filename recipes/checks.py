@@ -60,6 +60,8 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     for name, count in counts:
         if count < 1:
             raise ValueError(f"{name} must be at least 1, got {count}")
+    if not 0 <= config.checkpoint_minutes < float("inf"):
+        raise ValueError(f"checkpoint_minutes must be at least 0, got {config.checkpoint_minutes}")
     if config.post_train.group_size < 2:
         raise ValueError(f"post_train.group_size must be at least 2, got {config.post_train.group_size}")
     for name, rows, dealt in (

@@ -154,6 +154,8 @@ class WorldEnvConfig:
     """Of every random choice; demonstrations and initial states stay the same."""
     num_threads: int = 2
     """CPU threads. Beside other jobs 1 is faster: threads that wait for a busy core make all wait."""
+    checkpoint_minutes: float = 2.0
+    """Between two checkpoints of the running stage: at most so much is lost when it is killed."""
     tasks: tuple[str, ...] = GOAL_TASKS
     """``suite/name`` or a ``.bddl`` file, each once; ``task_id`` is the place in this list."""
     cameras: tuple[str, ...] = ("agentview",)

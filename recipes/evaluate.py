@@ -11,6 +11,7 @@ import torch
 
 from outcomes import Judge, outcomes_env, physics_outcomes
 from physics import recording
+from resumable import Resumable
 from run import Run
 from run_folder import RunFolder
 from stages import run_alone
@@ -24,43 +25,55 @@ def evaluate(run: Run, before: str, after: str, models: str | None) -> None:
 
     Without ``models`` there is no reflector, and its protocol is left out.
     """
-    config, folder = run.config, run.folder
+    folder = run.folder
     run.seed_everything("evaluate")
     reflector = None if models is None else Judge(run.reflector(models), run.rules(models)["real"])
-    for protocol in ("physics",) if reflector is None else ("physics", "reflector"):
-        outcomes: dict[str, dict[str, torch.Tensor]] = {}
-        for name in (before, after):
-            policy = run.policy(name)
-            actor = laplace_actor(policy)
-            judge = reflector if protocol == "reflector" else None
-            described = outcomes_env(run, config.tasks[0], "test", 1, judge, with_sim_state=True)
-            taking_part = {"policy": policy} | ({} if judge is None else {"reflector": judge.reflector})
-            about = recording(config, described, "evaluate", taking_part, policy=name, protocol=protocol)
-            described.close()
-            with RolloutWriter(folder.rollouts(f"evaluate_{protocol}_{name}"), **about, overwrite=True) as writer:
-                outcomes[name] = {
-                    task: physics_outcomes(
-                        run,
-                        actor,
-                        task,
-                        "test",
-                        config.evaluate.episodes_per_task,
-                        judge=judge,
-                        writer=writer,
-                        label=f"{name}, {protocol} stops",
-                    )
-                    for task in config.tasks
-                }
-        for name, per_task in outcomes.items():
-            _log(folder, protocol, name, "all", torch.cat(list(per_task.values())))
-            for task, success in per_task.items():
-                _log(folder, protocol, name, task, success)
-        for task in ("all", *config.tasks):
-            pair = [
-                torch.cat(list(o.values())) if task == "all" else o[task] for o in (outcomes[before], outcomes[after])
-            ]
-            test = paired_test(*pair)
-            folder.log("evaluate", protocol=protocol, task=task, paired=True, **{k: float(v) for k, v in test.items()})
+    protocols = ("physics",) if reflector is None else ("physics", "reflector")
+    pairs = [(protocol, name) for protocol in protocols for name in (before, after)]
+    found: list[dict[str, list[bool]]] = []  # of each pair, by task
+    for index in Resumable(run, "policies", len(pairs), minutes=0, found=found):  # a recording is whole or begins anew
+        protocol, name = pairs[index]
+        success = _rolled(run, protocol, name, reflector if protocol == "reflector" else None)
+        found.append({task: each.tolist() for task, each in success.items()})
+        if name == after:
+            earlier, later = ({task: torch.tensor(each) for task, each in one.items()} for one in found[-2:])
+            _log_protocol(folder, protocol, {before: earlier, after: later})
+
+
+def _rolled(run: Run, protocol: str, name: str, judge: Judge | None) -> dict[str, torch.Tensor]:
+    """Success bool ``[episodes]`` of a policy in every task; writes its recording."""
+    config, policy = run.config, run.policy(name)
+    actor = laplace_actor(policy)
+    described = outcomes_env(run, config.tasks[0], "test", 1, judge, with_sim_state=True)
+    taking_part = {"policy": policy} | ({} if judge is None else {"reflector": judge.reflector})
+    about = recording(config, described, "evaluate", taking_part, policy=name, protocol=protocol)
+    described.close()
+    with RolloutWriter(run.folder.rollouts(f"evaluate_{protocol}_{name}"), **about, overwrite=True) as writer:
+        return {
+            task: physics_outcomes(
+                run,
+                actor,
+                task,
+                "test",
+                config.evaluate.episodes_per_task,
+                judge=judge,
+                writer=writer,
+                label=f"{name}, {protocol} stops",
+            )
+            for task in config.tasks
+        }
+
+
+def _log_protocol(folder: RunFolder, protocol: str, outcomes: dict[str, dict[str, torch.Tensor]]) -> None:
+    """Of two policies, by task, and how they differ."""
+    whole = {name: {"all": torch.cat(list(per_task.values()))} | per_task for name, per_task in outcomes.items()}
+    for name, per_task in whole.items():
+        for task, success in per_task.items():
+            _log(folder, protocol, name, task, success)
+    earlier, later = whole.values()
+    for task, success in earlier.items():
+        test = paired_test(success, later[task])
+        folder.log("evaluate", protocol=protocol, task=task, paired=True, **{k: float(v) for k, v in test.items()})
 
 
 def _log(folder: RunFolder, protocol: str, policy: str, task: str, success: torch.Tensor) -> None:

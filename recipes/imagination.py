@@ -56,7 +56,7 @@ class Imagination:
             seed=seed,
             context_sampler=sampler,
         )
-        return TransformedEnv(env, Compose(Reflect(self.reflector, self.rule), FramesAside(run.folder.path)))
+        return TransformedEnv(env, Compose(Reflect(self.reflector, self.rule), FramesAside(run.folder.scratch)))
 
 
 def frames_aside(env: EnvBase) -> FramesAside | None:

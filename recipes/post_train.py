@@ -13,11 +13,11 @@ from typing import cast
 import torch
 from tensordict import TensorDictBase
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
-from tqdm import tqdm
 
 from imagination import Imagination, frames_aside
 from physics import exploring_actor, physics_waves_env, recording
 from probes import probe, probed_iterations, warning
+from resumable import Resumable
 from run import Run
 from stages import run_alone
 from updates import PATIENCE, STUCK, rate_factor, stuck, update
@@ -89,13 +89,15 @@ def post_train(
 
     probed, recorded = probed_iterations(settings), {0, settings.iterations - 1}
     alarm = HonestyAlarm(len(probed), false_alarm_rate=settings.false_alarm_rate) if probed and imagination else None
-    aside = frames_aside(env)
-    _record_next(True, collector, aside)
-    if watch is not None:
+    aside, counts = frames_aside(env), {"stuck": 0}
+    learning = {"collector": collector, "optimizer": optimizer, "mean": mean, "alarm": alarm, "counts": counts}
+    left = Resumable(run, "iterations", settings.iterations, **learning)
+    _record_next(left.step in recorded, collector, aside)
+    if watch is not None and not left.step:
         watch(0, averaged)
-    progress, started = tqdm(collector, total=settings.iterations, desc=target, unit="it"), time.monotonic()
-    stuck_for = 0
-    for iteration, wave in enumerate(progress):
+    waves, progress, started = iter(collector), left.bar(target, "it"), time.monotonic()
+    for iteration in progress:
+        wave = next(waves)
         factor = rate_factor(iteration, settings)
         for group, rate in zip(optimizer.param_groups, full_rates, strict=True):
             group["lr"] = factor * rate
@@ -110,9 +112,9 @@ def post_train(
         if iteration in recorded:  # of the weights that collected it
             about = recording(config, env, target, {"policy": policy} | judges, iteration=iteration)
         metrics = update(wave, policy.in_keys, loss, optimizer, list(groups.values()), settings)
-        stuck_for = stuck(stuck_for, metrics)
-        if stuck_for == PATIENCE:
-            progress.write(STUCK.format(target, iteration, stuck_for, settings.max_kl))
+        counts["stuck"] = stuck(counts["stuck"], metrics)
+        if counts["stuck"] == PATIENCE:
+            progress.write(STUCK.format(target, iteration, PATIENCE, settings.max_kl))
         if about:
             parts = wave.reshape(-1).split(64)
             wave.update(torch.cat([loss.ratios(part) for part in parts]).reshape(wave.shape))

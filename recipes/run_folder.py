@@ -3,7 +3,8 @@
 ``checkpoints/`` learned parts, ``rollouts/*.mcap`` logged rollouts, ``episodes/`` their frames on disk (a cache),
 ``metrics.jsonl`` one line a measurement, ``plots/*.png``, ``config.yaml`` the exact settings, ``tasks.json`` the
 digest of each task, ``versions.json`` the packages it ran with, ``stages/`` one marker per finished stage,
-``report.html``.
+``report.html``; while a stage runs, ``resume/<stage>/`` from where it would continue (:mod:`resumable`) and
+``scratch/``. ``run.lock`` keeps a second run out.
 """
 
 from __future__ import annotations
@@ -13,29 +14,38 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from folder_lock import FolderLock, lock_folder
 from worldenv_trl.report import machine_versions
 
 MIN_FREE_GB = 1.0
+_FREE_SETTINGS = {"run_dir", "num_threads", "checkpoint_minutes"}  # the result is the same
 
 
 class RunFolder:
     """A resumable run on disk.
 
     A stage is finished when its marker exists; its outputs are written under their final names only when complete, so
-    a crash loses at most the running stage, which simply runs again.
+    a crash loses at most the running stage, which continues from its last checkpoint.
+
+    Attributes:
+        running: the stage that this process is in, if any.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         if self.path.exists() and not self.path.is_dir():
             raise NotADirectoryError(f"run_dir must be a folder, {self.path} is a file; choose another --run-dir")
+        self.running: str | None = None
+        self._seconds = 0.0  # that the running stage has taken before this process
+        self._started = 0.0
+        self._lock: FolderLock | None = None
 
     @property
     def metrics_path(self) -> Path:
@@ -49,6 +59,17 @@ class RunFolder:
 
     def plot(self, name: str) -> Path:
         return self.path / "plots" / f"{name}.png"
+
+    def progress(self, stage: str) -> Path:
+        """Folder from where an unfinished stage continues."""
+        return self.path / "resume" / stage
+
+    @property
+    def scratch(self) -> Path:
+        """Folder for temporary files; what a killed stage has left there goes when the next one begins."""
+        path = self.path / "scratch"
+        path.mkdir(parents=True, exist_ok=True)
+        return path
 
     def require_checkpoint(self, name: str, stage: str) -> Path:
         """Path of a checkpoint that ``stage`` writes; raises ``FileNotFoundError`` naming the stage to run."""
@@ -65,7 +86,8 @@ class RunFolder:
         return path
 
     def open(self, config: Any, tasks: dict[str, str] | None = None) -> None:
-        """Creates the folder, or checks that the one found was made with the same settings and tasks.
+        """Creates the folder, or checks that the one found was made with the same settings and tasks, and locks it for
+        this process, until it ends or this object is gone. Reading needs no lock.
 
         Args:
             config: the settings, a dataclass.
@@ -73,10 +95,12 @@ class RunFolder:
 
         Raises:
             ValueError: if ``config.yaml`` exists and differs, naming the first settings that do, or a task has changed.
+            BlockingIOError: if another process runs on the folder, naming it.
             OSError: if less than :data:`MIN_FREE_GB` is free on the disk.
         """
         new = _plain(dataclasses.asdict(config))
         self.path.mkdir(parents=True, exist_ok=True)
+        self._lock = lock_folder(self.path)
         free_gb = shutil.disk_usage(self.path).free / 1e9
         if free_gb < MIN_FREE_GB:
             raise OSError(
@@ -87,8 +111,7 @@ class RunFolder:
             old = yaml.safe_load(stored.read_text())
             # What has become a setting since then was at its default.
             before, now = _flat(_plain(dataclasses.asdict(type(config)()))) | _flat(old), _flat(new)
-            free = {"run_dir", "num_threads"}
-            changed = [key for key in now if before.get(key) != now[key] and key not in free]
+            changed = [key for key in now if before.get(key) != now[key] and key not in _FREE_SETTINGS]
             if changed:
                 key, more = changed[0], f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
                 raise ValueError(
@@ -128,21 +151,43 @@ class RunFolder:
         return (self.path / "stages" / stage).exists()
 
     def forget(self, stage: str) -> None:
-        """Lets a finished stage run again."""
+        """Lets a stage, finished or not, run again from its beginning."""
+        shutil.rmtree(self.progress(stage), ignore_errors=True)
         (self.path / "stages" / stage).unlink(missing_ok=True)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Runs a stage: forgets the metrics an earlier, unfinished attempt left, and marks it finished at the end."""
-        marker = self.path / "stages" / name
-        marker.unlink(missing_ok=True)
+        """Runs a stage and marks it finished at the end.
+
+        What an earlier attempt has logged goes; a finished one's checkpoints, too, so that it begins anew. Its loops
+        bring back what belongs to the checkpoint from which they continue.
+        """
+        if self.done(name):
+            self.forget(name)
+        shutil.rmtree(self.path / "scratch", ignore_errors=True)
+        outer = self.running, self._started, self._seconds
+        self.running, self._started = name, time.monotonic()
+        self.restore_stage(name, 0.0, [])
+        try:
+            yield
+            seconds = self.stage_seconds()
+            self.log(name, seconds=seconds)
+            # Marked first: a crash in between leaves checkpoints that nobody reads.
+            _write_atomically(self.path / "stages" / name, f"{seconds:.1f}\n")
+            shutil.rmtree(self.progress(name), ignore_errors=True)
+            shutil.rmtree(self.path / "scratch", ignore_errors=True)
+        finally:
+            self.running, self._started, self._seconds = outer
+
+    def stage_seconds(self) -> float:
+        """That the running stage has taken, in this process and in those that it continues."""
+        return self._seconds + time.monotonic() - self._started
+
+    def restore_stage(self, name: str, seconds: float, lines: Iterable[dict[str, Any]]) -> None:
+        """Sets what the running stage has taken before this process, and its lines in ``metrics.jsonl``."""
+        self._seconds = seconds
         kept = [line for line in self.read_metrics() if line["stage"] != name]
-        _write_atomically(self.metrics_path, "".join(json.dumps(line) + "\n" for line in kept))
-        started = time.monotonic()
-        yield
-        seconds = time.monotonic() - started
-        self.log(name, seconds=seconds)
-        _write_atomically(marker, f"{seconds:.1f}\n")
+        _write_atomically(self.metrics_path, "".join(json.dumps(line) + "\n" for line in [*kept, *lines]))
 
     def log(self, stage: str, **values: Any) -> None:
         """Appends one line to ``metrics.jsonl``."""

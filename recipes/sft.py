@@ -13,14 +13,14 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.objectives import BCLoss
-from tqdm import trange
 
 from episodes import demonstrations
+from resumable import Resumable
 from run import Run
 from stages import run_alone
 from worldenv_trl import keys
 from worldenv_trl.data import policy_samples
-from worldenv_trl.policies import laplace_actor, likelihood_actor, random_shift
+from worldenv_trl.policies import Policy, laplace_actor, likelihood_actor, random_shift
 
 
 def fine_tune(run: Run) -> None:
@@ -34,14 +34,14 @@ def fine_tune(run: Run) -> None:
     learning = [parameter for parameter in policy.parameters() if parameter.requires_grad]
     others = [parameter for parameter in learning if all(parameter is not each for each in scale)]
     loss = _behaviour_cloning(laplace_actor(policy), loss_function="l1")
-    _train(loss, samples, others, settings.steps, settings.lr, run, "l1")
+    _train(policy, loss, samples, others, settings.steps, settings.lr, run, "l1")
 
     # Only the scale moves from here on (World-Env section 4.1).
     policy.requires_grad_(False)
     for parameter in scale:
         parameter.requires_grad_(True)
     loss = _behaviour_cloning(likelihood_actor(policy))
-    _train(loss, samples, scale, settings.scale_steps, settings.scale_lr, run, "nll")
+    _train(policy, loss, samples, scale, settings.scale_steps, settings.scale_lr, run, "nll")
     policy.save_pretrained(run.folder.checkpoint("sft"))
 
 
@@ -54,6 +54,7 @@ def _behaviour_cloning(actor: TensorDictModuleBase, **options: Any) -> BCLoss:
 
 
 def _train(
+    policy: Policy,
     loss: BCLoss,
     samples: TensorDictBase,
     parameters: list[torch.nn.Parameter],
@@ -68,7 +69,7 @@ def _train(
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
     )
-    progress = trange(steps, desc=f"sft {name}", unit="step")
+    progress = Resumable(run, name, steps, policy=policy, optimizer=optimizer, schedule=schedule).bar(f"sft {name}")
     for step in progress:
         batch = samples[torch.randint(len(samples), (settings.batch_size,))]
         for image in images:

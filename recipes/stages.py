@@ -18,6 +18,7 @@ from tqdm import tqdm
 from checks import check_config
 from config import PRESETS, WorldEnvConfig
 from parts import COMPACT, Parts
+from resumable import NotResumable
 from run import Run
 from run_folder import RunFolder
 from worldenv_trl.scenes import load_task
@@ -77,7 +78,8 @@ def run_stages(run: Run, works: Mapping[str, Work]) -> None:
 
 
 def run_alone(kind: str, work: Work, arguments: Sequence[str] | None = None, parts: Parts = COMPACT) -> None:
-    """Runs one stage of a preset alone, again if it is finished; of several rounds, the first unfinished one.
+    """Runs one stage of a preset alone, from the beginning if it is finished, else from where it was interrupted; of
+    several rounds, the first unfinished one.
 
     The stages after it, which learned from what it made before, count as not finished from then on.
     """
@@ -135,7 +137,7 @@ def _run(stage: Stage, work: Work, run: Run) -> None:
         with run.folder.stage(stage.name), warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: tqdm.write(f"warning: {message}", file=sys.stderr)
             work(run, **stage.options)
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotResumable) as error:
         raise SystemExit(f"error: {error}") from error
     except BaseException as error:
         if not interrupted.is_set():

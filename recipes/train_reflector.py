@@ -11,9 +11,9 @@ import tempfile
 from typing import cast
 
 import torch
-from tqdm import trange
 
 from episodes import demonstrations_and_exploration, split_by_context
+from resumable import Resumable
 from run import LATE, Run, write_rules
 from stages import run_alone
 from worldenv_trl import keys
@@ -33,7 +33,7 @@ def train_reflector(run: Run, target: str = "reflector", models: str = "", round
     world_model = run.world_model(models)
     share = min(1.0, settings.imagined_share / max(1e-6, 1 - settings.imagined_share))
     chosen = torch.randperm(len(training))[: round(share * len(training))]
-    with tempfile.TemporaryDirectory(dir=run.folder.path) as scratch:
+    with tempfile.TemporaryDirectory(dir=run.folder.scratch) as scratch:
 
         def imagine(episodes: Episodes, name: str) -> Episodes:
             label, folder, seed = f"{target} imagines {name}", f"{scratch}/{name}", run.seed(target, f"imagines {name}")
@@ -70,10 +70,12 @@ def train_reflector(run: Run, target: str = "reflector", models: str = "", round
 def learn(run: Run, reflector: Reflector, episodes: Episodes, target: str) -> None:
     """The reflector's lessons, one after the other; none for one that needs no training."""
     loss = ReflectorLoss(reflector)
-    for lesson in reflector.train_on(episodes):
+    for number, lesson in enumerate(reflector.train_on(episodes)):
         optimizer = torch.optim.AdamW(lesson.parameters, lr=lesson.lr, weight_decay=lesson.weight_decay)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, lesson.lr, total_steps=lesson.steps)
-        for step in trange(lesson.steps, desc=f"{target} {lesson.name}", unit="step"):
+        parts = {"reflector": reflector, "optimizer": optimizer, "schedule": schedule}
+        left = Resumable(run, f"{number}_{lesson.name}", lesson.steps, **parts)
+        for step in left.bar(f"{target} {lesson.name}"):
             out = loss(lesson.sample())
             optimizer.zero_grad()
             out["loss_reflector"].backward()

@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 import tempfile
 import time
+from typing import Any
 
 import torch
-from tqdm import trange
 
 from episodes import demonstrations_and_exploration, split_by_context
+from resumable import Resumable
 from run import Run
 from stages import run_alone
 from worldenv_trl.data import Episodes, WindowBuffer, imagine_episodes, window_buffer
@@ -52,7 +53,10 @@ def _train(
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 100) * (0.02 + 0.49 * (1 + math.cos(math.pi * step / steps)))
     )
-    progress, started, running = trange(steps, desc=target, unit="step"), time.monotonic(), None
+    shown: dict[str, Any] = {"loss": None}  # its running mean
+    parts = {"model": model, "optimizer": optimizer, "schedule": schedule, "windows": windows, "shown": shown}
+    left = Resumable(run, "steps", steps, **parts)
+    progress, started, first = left.bar(target), time.monotonic(), left.step
     for step in progress:
         value = loss(windows.sample())["loss_world_model"]
         optimizer.zero_grad()
@@ -60,11 +64,11 @@ def _train(
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
         schedule.step()
-        running = value.item() if running is None else 0.98 * running + 0.02 * value.item()
+        shown["loss"] = value.item() if shown["loss"] is None else 0.98 * shown["loss"] + 0.02 * value.item()
         if step % 50 == 0 or step == steps - 1:
-            speed = (step + 1) / (time.monotonic() - started)
-            run.folder.log(target, step=step, loss=running, steps_per_second=speed)
-            progress.set_postfix(loss=f"{running:.4f}")
+            speed = (step + 1 - first) / (time.monotonic() - started)
+            run.folder.log(target, step=step, loss=shown["loss"], steps_per_second=speed)
+            progress.set_postfix(loss=f"{shown['loss']:.4f}")
 
 
 def fidelity(run: Run, model: WorldModel, episodes: Episodes, seed: int) -> dict[str, float]:
@@ -73,7 +77,7 @@ def fidelity(run: Run, model: WorldModel, episodes: Episodes, seed: int) -> dict
     Figures of further cameras end in their names.
     """
     figures: dict[str, float] = {}
-    with tempfile.TemporaryDirectory(dir=run.folder.path) as scratch:
+    with tempfile.TemporaryDirectory(dir=run.folder.scratch) as scratch:
         imagined = imagine_episodes(model, episodes, run.kinematics, seed=seed, folder=scratch)
         for horizon in (horizon for horizon in HORIZONS if horizon <= episodes["actions"].shape[1]):
             alive = (episodes["length"].squeeze(-1) >= horizon).nonzero().squeeze(-1)

@@ -6,7 +6,8 @@ From five demonstrations per task to a policy post-trained by reinforcement lear
     python recipes/world_env.py improve    # meant to raise held-out success: at most 60 minutes; extra vision
     python recipes/world_env.py improve --help
 
-The same command continues an interrupted run: finished stages are skipped, the running one starts again.
+The same command continues an interrupted run: finished stages are skipped, the running one goes on from its last
+checkpoint, to the same weights bit for bit.
 """
 
 from __future__ import annotations

@@ -123,6 +123,7 @@ def main(settings: Learning) -> None:
     shutil.copytree(checkpoint, run.folder.checkpoint("sft"), dirs_exist_ok=True)
     measured = Measured(run, settings)
     with run.folder.stage(STAGE):
+        run.folder.forget("post_train")  # the returns' own random numbers are not in its checkpoints
         rerun("post_train", partial(post_train, returns_of=measured.returns_of, watch=measured.watch), run)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -80,6 +81,23 @@ class ContextOrder:
         self._turn = 0  # of the tasks, for a sampler
         if self.sampler is not None:
             self.sampler.seed(seed)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the draws are, the sampler's included."""
+        sampler = None if self.sampler is None else self.sampler.state_dict()
+        return {
+            "generator": self._generator.get_state(),
+            "queue": list(self._queue),
+            "turn": self._turn,
+            "sampler": sampler,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Draws on from there, of the same contexts."""
+        self._generator.set_state(state_dict["generator"])
+        self._queue, self._turn = list(state_dict["queue"]), state_dict["turn"]
+        if self.sampler is not None:
+            self.sampler.load_state_dict(state_dict["sampler"])
 
     def draw(self, count: int) -> list[int]:
         """Places in the contexts [K] of the next ``count`` groups: no context twice in a draw if it can be."""

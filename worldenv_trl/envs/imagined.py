@@ -175,6 +175,16 @@ class ImaginedEnv(EnvBase):
 
     # ------------------------------------------------------------------------------------------------- reset
 
+    def order_state(self) -> dict[str, Any]:
+        """What decides which contexts and which noise the next reset of all rows begins with; take it between waves."""
+        return {"seed": self._seed, "order": self._order.state_dict(), "resets": self._resets.clone()}
+
+    def load_order_state(self, state: dict[str, Any]) -> None:
+        """Lets the next reset of all rows begin as it would have where :meth:`order_state` gave ``state``."""
+        self._seed = state["seed"]
+        self._order.load_state_dict(state["order"])
+        self._resets.copy_(state["resets"])
+
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
         groups, rollouts = self.batch_size
         mask = tensordict.get("_reset", None) if tensordict is not None else None

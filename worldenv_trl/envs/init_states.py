@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -83,6 +84,18 @@ class InitStates:
         self._sampled: dict[int, int] = {}  # the state of each episode that a sampler drew
         if self.sampler is not None:
             self.sampler.seed(seed)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The seed and, of a sampler, what it has drawn and where it is."""
+        sampler = None if self.sampler is None else self.sampler.state_dict()
+        return {"seed": self._seed, "sampled": dict(self._sampled), "sampler": sampler}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Draws on from there, of the same states."""
+        self.seed(state_dict["seed"])
+        self._sampled = dict(state_dict["sampled"])
+        if self.sampler is not None:
+            self.sampler.load_state_dict(state_dict["sampler"])
 
     def draw(self, number: int) -> tuple[int, np.ndarray]:
         """Context id and state ``[S]`` of the task's ``number``-th episode: a function of seed and number only, but for

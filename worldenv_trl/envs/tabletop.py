@@ -220,6 +220,17 @@ class TabletopEnv(EnvBase):
         for block in self._blocks:
             block.starts.seed(self._seed)
 
+    def order_state(self) -> dict[str, Any]:
+        """What decides which initial states the next reset of all rows begins with; take it between waves."""
+        starts = [block.starts.state_dict() for block in self._blocks]
+        return {"seed": self._seed, "episode": torch.tensor(self._episode), "starts": starts}
+
+    def load_order_state(self, state: dict[str, Any]) -> None:
+        """Lets the next reset of all rows begin as it would have where :meth:`order_state` gave ``state``."""
+        self._seed, self._episode = state["seed"], state["episode"].numpy().copy()
+        for block, starts in zip(self._blocks, state["starts"], strict=True):
+            block.starts.load_state_dict(starts)
+
     @property
     def num_envs(self) -> int:
         return self.batch_size[0]

@@ -93,6 +93,14 @@ class HonestyAlarm:
         fired = p_value < self.false_alarm_rate / self.comparisons and up > 0 and real_up < self.share * up
         return Watch(fired, p_value, up, real_up)
 
+    def state_dict(self) -> dict[str, list[Tensor]]:
+        """The probes so far."""
+        return {"imagined": list(self._imagined), "real": list(self._real)}
+
+    def load_state_dict(self, state_dict: dict[str, list[Tensor]]) -> None:
+        """Goes on after those probes."""
+        self._imagined, self._real = list(state_dict["imagined"]), list(state_dict["real"])
+
     def _rise(self, values: list[Tensor]) -> Tensor:
         return torch.stack(values[-self.window :]).sum(0) - torch.stack(values[: self.window]).sum(0)
 
