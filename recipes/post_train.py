@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -90,8 +90,8 @@ def post_train(
     probed, recorded = probed_iterations(settings), {0, settings.iterations - 1}
     alarm = HonestyAlarm(len(probed), false_alarm_rate=settings.false_alarm_rate) if probed and imagination else None
     aside, counts = frames_aside(env), {"stuck": 0}
-    learning = {"collector": collector, "optimizer": optimizer, "mean": mean, "alarm": alarm, "counts": counts}
-    left = Resumable(run, "iterations", settings.iterations, **learning)
+    learning: dict[str, Any] = {"collector": collector, "optimizer": optimizer, "mean": mean, "alarm": alarm}
+    left = Resumable(run, "iterations", settings.iterations, counts=counts, **learning)
     _record_next(left.step in recorded, collector, aside)
     if watch is not None and not left.step:
         watch(0, averaged)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
-from typing import cast
+from typing import Any, cast
 
 import torch
 
@@ -73,7 +73,7 @@ def learn(run: Run, reflector: Reflector, episodes: Episodes, target: str) -> No
     for number, lesson in enumerate(reflector.train_on(episodes)):
         optimizer = torch.optim.AdamW(lesson.parameters, lr=lesson.lr, weight_decay=lesson.weight_decay)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, lesson.lr, total_steps=lesson.steps)
-        parts = {"reflector": reflector, "optimizer": optimizer, "schedule": schedule}
+        parts: dict[str, Any] = {"reflector": reflector, "optimizer": optimizer, "schedule": schedule}
         left = Resumable(run, f"{number}_{lesson.name}", lesson.steps, **parts)
         for step in left.bar(f"{target} {lesson.name}"):
             out = loss(lesson.sample())

@@ -8,9 +8,11 @@ import pytest
 import torch
 from imagined_worlds import FK, CountingWorldModel, given, make_contexts, make_env
 from tensordict import TensorDict
+from torchrl.envs.transforms import StepCounter, TransformedEnv
 
+from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import ContextSampler, ImaginedEnv, InitStates, TabletopEnv
-from worldenv_trl.keys import CONTEXT_ID, TASK_ID
+from worldenv_trl.keys import CONTEXT_ID, NOISE_SEED, STATE, TASK_ID
 from worldenv_trl.scenes import load_task
 
 DRAWER, BOWL, STOVE = (
@@ -187,3 +189,37 @@ def test_contexts_without_numbers_are_refused_when_the_env_is_built():
 def test_an_order_that_is_fixed_and_a_sampler_are_refused(mode):
     with pytest.raises(ValueError, match=f"init_state_mode must be 'random', got '{mode}'"):
         TabletopEnv(DRAWER, 2, cameras=(), init_state_mode=mode, context_sampler=ContextSampler())
+
+
+# ----------------------------------------------------------------------------------------------------- going on
+
+
+@BOTH
+@pytest.mark.parametrize("mixed", [False, True])
+def test_a_collector_goes_on_with_the_contexts_and_the_noise_that_come_next(make, mixed):
+    def collector(seed):
+        sampler = ContextSampler() if mixed else None
+        env = TransformedEnv(make(2, 2, sampler), StepCounter(max_steps=2))
+        env.set_seed(seed)
+        return GroupCollector(env, groups_per_batch=2, total_groups=12, group_size=2), sampler
+
+    def wave(each, sampler):
+        torch.manual_seed(0)  # of the actions
+        out = each.next()
+        if mixed:
+            sampler.update(out[CONTEXT_ID][:, 0, 0, 0], torch.tensor([[0.0, 1.0], [1.0, 1.0]]))
+        return out
+
+    (whole, whole_sampler), (first, first_sampler), (second, second_sampler) = (collector(seed) for seed in (3, 3, 4))
+    expected = [wave(whole, whole_sampler) for _ in range(5)]
+    for _ in range(3):
+        wave(first, first_sampler)
+    second.load_state_dict(first.state_dict())
+    for later in expected[3:]:
+        now = wave(second, second_sampler)
+        assert torch.equal(now[CONTEXT_ID], later[CONTEXT_ID])
+        assert torch.equal(now["next", STATE], later["next", STATE])
+        if make is imagined:
+            assert torch.equal(now["next", NOISE_SEED], later["next", NOISE_SEED])
+    for each in (whole, first, second):
+        each.shutdown()

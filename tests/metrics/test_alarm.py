@@ -86,3 +86,14 @@ def test_bad_settings_and_probes_are_named():
     alarm.update([True, False], [True, True])
     with pytest.raises(ValueError, match="same contexts as before"):
         alarm.update([True], [True])
+
+
+def test_an_alarm_goes_on_from_its_state():
+    probes = [(torch.arange(16) < count, torch.arange(16) < 4) for count in (4, 5, 12, 14)]
+    whole, first, second = (HonestyAlarm(4, window=1) for _ in range(3))
+    expected = [whole.update(*probe) for probe in probes]
+    for probe in probes[:2]:
+        first.update(*probe)
+    second.load_state_dict(first.state_dict())
+    assert [second.update(*probe) for probe in probes[2:]] == expected[2:]
+    assert expected[-1].fired and not HonestyAlarm(4, window=1).update(*probes[-1]).fired

@@ -40,6 +40,8 @@ def benchmark(name: str):
         ("expert", {"tasks": ("nowhere.bddl",)}, "there is no task file nowhere.bddl"),
         ("expert", {"count": 0}, "--count must be at least 1, got 0"),
         ("expert", {"processes": 0}, "--processes must be at least 1, got 0"),
+        ("resume", {"kills": -1}, "--kills must be at least 0, got -1"),
+        ("resume", {"minutes": -1.0}, "--minutes must be at least 0, got -1.0"),
         ("sft", {"suite": "gaol"}, "unknown suite 'gaol'"),
         ("sft", {"episodes_per_task": 0}, "--episodes-per-task must be at least 1, got 0"),
         ("sft", {"num_threads": 0}, "num_threads must be at least 1, got 0"),

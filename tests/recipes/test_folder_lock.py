@@ -26,7 +26,8 @@ HOLD = (
 def other_process(folder: Path, then: str) -> subprocess.Popen:
     environment = os.environ | {"PYTHONPATH": str(Path(folder_lock.__file__).parent)}
     arguments = [sys.executable, "-c", HOLD + then, str(folder)]
-    return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    return subprocess.Popen(arguments, **pipes, text=True, env=environment)
 
 
 @pytest.fixture

@@ -1,0 +1,188 @@
+"""A run that is killed again and again against one that is not: ``python recipes/benchmarks/resume.py [--kills 20]``.
+
+The same small run, all seven stages, is made twice: once without a break, once by processes that get SIGKILL at random
+moments, the kills being dealt to the stages in turn, and that are started again on the same folder. The weights of
+every part and every figure in ``metrics.jsonl`` but times must be the same, bit for bit. Lost is what a kill undoes:
+the time since the newest checkpoint of its stage, or since the process took up the stage.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import multiprocessing
+import random
+import signal
+import statistics
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+import torch
+import tyro
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from command_line import at_least, refusals
+from config import (
+    GOAL_TASKS,
+    PRESETS,
+    SFT,
+    Demonstrate,
+    Evaluate,
+    Explore,
+    PostTrain,
+    Reflector,
+    WorldEnvConfig,
+    WorldModel,
+)
+from run_folder import RunFolder
+from stages import open_run, plan, run_stages
+from world_env import WORKS
+
+_START = multiprocessing.get_context("forkserver")  # imports torch once for all processes
+_START.set_forkserver_preload(["world_env"])
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """How often the run is killed."""
+
+    kills: int = 20
+    minutes: float = 0.05
+    """Between two checkpoints."""
+    seed: int = 0
+    """Of the moments and of the run."""
+
+
+@dataclass(frozen=True)
+class Kill:
+    stage: str
+    lost: float
+    """Seconds."""
+
+
+def small(path: Path, settings: Benchmark) -> WorldEnvConfig:
+    """A minute or two of computing for all stages."""
+    return dataclasses.replace(
+        PRESETS["smoke"][1],
+        run_dir=path,
+        seed=settings.seed,
+        num_threads=1,
+        checkpoint_minutes=settings.minutes,
+        tasks=GOAL_TASKS[1:2],
+        train_states=8,
+        demonstrate=Demonstrate(episodes_per_task=2),
+        sft=SFT(steps=60, scale_steps=20),
+        explore=Explore(episodes_per_task=16, num_envs=8, scale_factors=(0.0, 1.0)),
+        world_model=WorldModel(steps=30, batch_size=4),
+        reflector=Reflector(encoder_steps=20, steps=40, batch_size=8),
+        post_train=PostTrain(iterations=4, groups=2, group_size=4, epochs=2, probe_every=2, probe_contexts=4),
+        evaluate=Evaluate(episodes_per_task=8, num_envs=4),
+    )
+
+
+def work(config: WorldEnvConfig) -> None:
+    """What a process does."""
+    torch.set_num_threads(config.num_threads)
+    run_stages(open_run(config), WORKS)
+
+
+def started(config: WorldEnvConfig) -> BaseProcess:
+    process = _START.Process(target=work, args=(config,))
+    process.start()
+    return process
+
+
+def ended(process: BaseProcess) -> None:
+    """Waits for the end; raises ``RuntimeError`` if it was not a good one."""
+    process.join()
+    if process.exitcode != 0:
+        raise RuntimeError(f"a process ended with code {process.exitcode}")
+
+
+def killed_run(config: WorldEnvConfig, stage_seconds: dict[str, float], settings: Benchmark) -> list[Kill]:
+    """Kills as many processes as asked for, then lets the last one finish."""
+    draw, folder, kills = random.Random(settings.seed), RunFolder(config.run_dir), []
+    names = list(stage_seconds)
+    for number in range(settings.kills):
+        place = number * len(names) // settings.kills
+        before = _written(folder)
+        process = started(config)
+        # A stage that begins writes the metrics anew.
+        while process.is_alive() and (_written(folder) == before or not all(map(folder.done, names[:place]))):
+            time.sleep(0.01)
+        begun = time.time()
+        process.join(draw.uniform(0.0, stage_seconds[names[place]]))
+        if not process.is_alive():
+            ended(process)  # the whole run is finished
+            break
+        process.kill()
+        at = time.time()
+        process.join()
+        if process.exitcode != -signal.SIGKILL:
+            raise RuntimeError(f"the process that should be killed ended by itself, with code {process.exitcode}")
+        stage = next((name for name in names if not folder.done(name)), names[-1])
+        kept = [path.stat().st_mtime for path in folder.progress(stage).glob("*.torchrl")]
+        kept += [(folder.path / "stages" / name).stat().st_mtime for name in names if folder.done(name)]
+        kills.append(Kill(stage, at - max([begun, *(moment for moment in kept if moment < at)])))
+        print(f"kill {number + 1} in {stage}, {kills[-1].lost:.1f} s lost", flush=True)
+    ended(started(config))
+    return kills
+
+
+def _written(folder: RunFolder) -> int:
+    """When the metrics were written last."""
+    return folder.metrics_path.stat().st_mtime_ns if folder.metrics_path.exists() else 0
+
+
+def differences(first: Path, second: Path, stages: list[str]) -> list[str]:
+    """Weights and figures in which two run folders differ."""
+    found = []
+    for part in sorted(path.relative_to(first) for path in (first / "checkpoints").rglob("*") if path.is_file()):
+        other = second / part
+        if not other.is_file() or other.read_bytes() != (first / part).read_bytes():
+            found.append(str(part))
+    for stage in stages:
+        texts = [[_timeless(line) for line in RunFolder(path).read_metrics(stage)] for path in (first, second)]
+        if texts[0] != texts[1]:
+            found.append(f"metrics of {stage}")
+    return found
+
+
+def _timeless(line: dict) -> str:
+    return json.dumps({name: value for name, value in line.items() if "second" not in name})
+
+
+def main(settings: Benchmark) -> None:
+    with refusals():
+        at_least(0, kills=settings.kills, seed=settings.seed)
+        if not settings.minutes >= 0:
+            raise ValueError(f"--minutes must be at least 0, got {settings.minutes}")
+    with tempfile.TemporaryDirectory() as name:
+        folders = [Path(name) / each for each in ("straight", "killed")]
+        straight, killed = (small(folder, settings) for folder in folders)
+        begun = time.monotonic()
+        ended(started(straight))
+        whole, stages = time.monotonic() - begun, [stage.name for stage in plan(straight)]
+        seconds = {stage: RunFolder(folders[0]).read_metrics(stage)[-1]["seconds"] for stage in stages}
+        print(f"without a break: {whole:.0f} s; " + ", ".join(f"{stage} {each:.1f}" for stage, each in seconds.items()))
+        kills = killed_run(killed, seconds, settings)
+        found = differences(*folders, stages)
+        parts = sorted(path.name for path in (folders[0] / "checkpoints").iterdir())
+    lost = [kill.lost for kill in kills]
+    counts = {stage: sum(kill.stage == stage for kill in kills) for stage in stages}
+    print(f"killed {len(kills)} times, by stage: " + ", ".join(f"{stage} {count}" for stage, count in counts.items()))
+    if lost:
+        ends = statistics.median(lost), max(lost), sum(lost) / 60
+        print(f"lost: {ends[0]:.1f} s (median), {ends[1]:.1f} s (most), {ends[2]:.2f} minutes in all")
+    print(f"{', '.join(parts)} and all figures: " + ("bit for bit the same" if not found else f"differ in {found}"))
+    if found:
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Benchmark, description=__doc__))

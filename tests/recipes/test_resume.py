@@ -1,0 +1,166 @@
+"""Every stage with a loop, interrupted and continued, against a run that nothing interrupts: bit for bit."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+import config
+from post_train import post_train
+from resumable import Resumable
+from run import Run
+from run_folder import RunFolder
+from stages import open_run, plan, rerun, run_stages
+from world_env import WORKS
+from worldenv_trl import keys
+from worldenv_trl.record import read_rollouts
+
+SETTINGS = dataclasses.replace(
+    config.PRESETS["smoke"][1],
+    checkpoint_minutes=1000.0,
+    num_threads=1,
+    tasks=config.GOAL_TASKS[1:2],
+    max_steps=16,
+    train_states=4,
+    demonstrate=config.Demonstrate(episodes_per_task=1),
+    sft=config.SFT(steps=4, scale_steps=3, batch_size=8),
+    explore=config.Explore(episodes_per_task=8, num_envs=4, scale_factors=(1.0,)),
+    world_model=config.WorldModel(steps=4, batch_size=2),
+    reflector=config.Reflector(encoder_steps=3, steps=3, batch_size=4),
+    post_train=config.PostTrain(
+        iterations=3, groups=2, group_size=2, epochs=1, probe_every=1, probe_contexts=2, contexts="mixed"
+    ),
+    evaluate=config.Evaluate(episodes_per_task=2, num_envs=2),
+)
+
+
+class Interrupted(Exception):
+    """In the middle of a step."""
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory):
+    """The folder of a run that nothing interrupts and whose loops save nothing before their ends."""
+    path = tmp_path_factory.mktemp("straight") / "run"
+    threads = torch.get_num_threads()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("demonstrate.check_solved", lambda *_: None)  # 16 steps are too few for the expert
+        run_stages(open_run(dataclasses.replace(SETTINGS, run_dir=path)), WORKS)
+    torch.set_num_threads(threads)
+    return path
+
+
+def copy_of(straight: Path, path: Path, **changes) -> Run:
+    """The run in another folder, opened for other settings."""
+    shutil.copytree(straight, path)
+    settings, folder = dataclasses.replace(SETTINGS, run_dir=path, **changes), RunFolder(path)
+    (path / "config.yaml").unlink()
+    folder.open(settings)
+    return Run(settings, folder)
+
+
+def break_at(monkeypatch, name: str, call: int) -> None:
+    """Lets the so many-th call of ``name`` fail."""
+    module, _, attribute = name.rpartition(".")
+    owner = torch.Tensor if module == "torch.Tensor" else __import__(module)
+    original, calls = getattr(owner, attribute), []
+
+    def counted(*arguments, **options):
+        calls.append(None)
+        if len(calls) == call:
+            raise Interrupted
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(owner, attribute, counted)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def metrics(folder: RunFolder, stage: str) -> list[str]:
+    """Every line of a stage as text, but for times."""
+    lines = folder.read_metrics(stage)
+    return [json.dumps({name: value for name, value in line.items() if "second" not in name}) for line in lines]
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "call", "said"),
+    [
+        ("sft", "torch.Tensor.backward", 4, "sft: l1 continues after step 2 of 4"),
+        ("sft", "torch.Tensor.backward", 7, "sft: nll continues after step 2 of 3"),
+        ("train_world_model", "torch.Tensor.backward", 4, "world_model: steps continues after step 2 of 4"),
+        ("train_world_model", "train_world_model.psnr", 1, "world_model: steps was finished"),
+        ("train_reflector", "torch.Tensor.backward", 3, "reflector: 0_encoder continues after step 2 of 3"),
+        ("train_reflector", "torch.Tensor.backward", 6, "reflector: 1_head continues after step 2 of 3"),
+        ("post_train", "post_train.rloo_advantage", 3, "post_train: iterations continues after step 2 of 3"),
+        ("evaluate", "evaluate.physics_outcomes", 4, "evaluate: policies continues after step 3 of 4"),
+    ],
+)
+def test_a_stage_continues_to_the_same_weights_and_metrics(
+    straight, tmp_path, monkeypatch, capsys, kind, name, call, said
+):
+    run = copy_of(straight, tmp_path / "run")
+    stage = next(stage for stage in plan(run.config) if stage.kind == kind)
+    shutil.rmtree(run.folder.checkpoint(stage.name), ignore_errors=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(Resumable, "_due", lambda self: not self._minutes or self.step % 2 == 0)
+        break_at(patch, name, call)
+        with pytest.raises(Interrupted):
+            rerun(kind, WORKS[kind], run)
+    torch.manual_seed(1)
+    capsys.readouterr()
+    rerun(kind, WORKS[kind], run)
+    assert f"{said}\n" in capsys.readouterr().out
+    assert metrics(run.folder, stage.name) == metrics(RunFolder(straight), stage.name)
+    expected = files(straight / "checkpoints" / stage.name)
+    assert files(run.folder.checkpoint(stage.name)) == expected and bool(expected) == (kind != "evaluate")
+    for recording in straight.glob(f"rollouts/{stage.name}_*.mcap"):
+        waves = [read_rollouts(path / "rollouts" / recording.name) for path in (straight, run.folder.path)]
+        for key in (keys.CHUNK, ("next", keys.STEP_MASK), keys.CONTEXT_ID, ("next", *keys.IMAGE)):
+            if waves[0].get(key, None) is not None:
+                assert torch.equal(waves[0][key], waves[1][key])
+    left = {path.name for path in run.folder.path.iterdir()} - {path.name for path in straight.iterdir()}
+    assert left == set() and not list((run.folder.path / "resume").iterdir())
+
+
+@pytest.mark.parametrize("contexts", ["uniform", "mixed"])
+def test_loop_in_the_physics_continues_to_the_same_weights(straight, tmp_path, monkeypatch, contexts):
+    learned = dataclasses.replace(SETTINGS.post_train, env="tabletop", contexts=contexts, probe_every=2)
+
+    def loop(run):
+        with run.folder.stage("post_train"):
+            post_train(run, "sft", "post_train", "")
+
+    runs = [copy_of(straight, tmp_path / name, post_train=learned) for name in ("straight", "broken")]
+    for run in runs:
+        run.folder.forget("post_train")
+        shutil.rmtree(run.folder.checkpoint("post_train"))
+    loop(runs[0])
+    with monkeypatch.context() as patch:
+        patch.setattr(Resumable, "_due", lambda self: True)
+        break_at(patch, "post_train.rloo_advantage", 3)
+        with pytest.raises(Interrupted):
+            loop(runs[1])
+    torch.manual_seed(1)
+    loop(runs[1])
+    weights = [files(run.folder.checkpoint("post_train")) for run in runs]
+    assert weights[0] == weights[1] and weights[0] != files(straight / "checkpoints" / "post_train")
+    assert metrics(runs[0].folder, "post_train") == metrics(runs[1].folder, "post_train")
+
+
+def test_an_earlier_stage_that_runs_again_takes_the_checkpoints_of_the_later_ones(straight, tmp_path, monkeypatch):
+    run = copy_of(straight, tmp_path / "run")
+    with monkeypatch.context() as patch:
+        patch.setattr(Resumable, "_due", lambda self: True)
+        break_at(patch, "post_train.rloo_advantage", 3)
+        with pytest.raises(Interrupted):
+            rerun("post_train", WORKS["post_train"], run)
+    assert list(run.folder.progress("post_train").iterdir())
+    rerun("sft", WORKS["sft"], run)
+    assert not run.folder.progress("post_train").exists()
