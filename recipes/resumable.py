@@ -124,7 +124,7 @@ class Resumable:
         for left in folder.glob(".*"):  # of a process that was killed while it saved
             shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink()
         broken = []
-        for path in sorted(folder.glob(f"{self._rotation.prefix}-*.torchrl"), reverse=True):
+        for path in sorted(folder.glob(f"{self._rotation.prefix}-{12 * '[0-9]'}.torchrl"), reverse=True):
             if _is_whole(path):
                 self._load(path)
                 self._folder.restore_stage(stage, self._noted["seconds"], map(json.loads, self._noted["metrics"]))
@@ -133,7 +133,7 @@ class Resumable:
                 tqdm.write(f"{stage}: {self.name} {'was finished' if self.step == self.total else done}")
                 break
             broken.append(path)
-            tqdm.write(f"warning: {path} is cut short or damaged: the one before it is taken", file=sys.stderr)
+            tqdm.write(f"warning: {path} is cut short or damaged: the one before it is taken, if any", file=sys.stderr)
         for path in broken:  # a later step in its name would keep newer ones from being the newest
             path.unlink()
 

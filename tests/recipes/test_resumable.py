@@ -135,7 +135,7 @@ def test_a_damaged_checkpoint_costs_a_warning_and_the_steps_since_the_one_before
     newest.write_bytes({"cut": bytes(data[: len(data) // 2]), "flip": bytes(data), "empty": b""}[damage])
     assert torch.equal(learn(run), straight[0]) and steps_logged(run) == straight[1]
     told = capsys.readouterr()
-    assert told.err == f"warning: {newest} is cut short or damaged: the one before it is taken\n"
+    assert told.err == f"warning: {newest} is cut short or damaged: the one before it is taken, if any\n"
     assert "continues after step 6 of 12" in told.out
 
 
@@ -207,6 +207,19 @@ def test_a_checkpoint_of_another_loop_size_or_number_of_processes_is_refused(tmp
     with pytest.raises(NotResumable, match="was saved by 1 processes, now 2"):
         loop(model=torch.nn.Linear(2, 2))
     assert len(checkpoints(run)) == 2
+
+
+def test_loops_whose_names_begin_alike_keep_apart(tmp_path):
+    run = open_run(tmp_path / "run")
+    heads = {name: torch.nn.Linear(2, 2) for name in ("head", "head-2", "head/3")}
+    with pytest.raises(KeyboardInterrupt), run.folder.stage("sft"):
+        for name, head in heads.items():
+            list(Resumable(run, name, 2, model=head))
+        raise KeyboardInterrupt
+    with run.folder.stage("sft"):
+        for name, head in heads.items():
+            again = torch.nn.Linear(2, 2)
+            assert list(Resumable(run, name, 2, model=again)) == [] and torch.equal(again.weight, head.weight)
 
 
 def test_outside_a_stage_nothing_is_saved(tmp_path):
