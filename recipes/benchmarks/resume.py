@@ -52,7 +52,7 @@ class Benchmark:
     """How often the run is killed."""
 
     kills: int = 20
-    minutes: float = 0.05
+    minutes: float = 0.02
     """Between two checkpoints."""
     seed: int = 0
     """Of the moments and of the run."""
@@ -66,7 +66,7 @@ class Kill:
 
 
 def small(path: Path, settings: Benchmark) -> WorldEnvConfig:
-    """A minute or two of computing for all stages."""
+    """Half a minute of computing for all stages."""
     return dataclasses.replace(
         PRESETS["smoke"][1],
         run_dir=path,
@@ -75,13 +75,13 @@ def small(path: Path, settings: Benchmark) -> WorldEnvConfig:
         checkpoint_minutes=settings.minutes,
         tasks=GOAL_TASKS[1:2],
         train_states=8,
-        demonstrate=Demonstrate(episodes_per_task=2),
-        sft=SFT(steps=60, scale_steps=20),
-        explore=Explore(episodes_per_task=16, num_envs=8, scale_factors=(0.0, 1.0)),
-        world_model=WorldModel(steps=30, batch_size=4),
-        reflector=Reflector(encoder_steps=20, steps=40, batch_size=8),
-        post_train=PostTrain(iterations=4, groups=2, group_size=4, epochs=2, probe_every=2, probe_contexts=4),
-        evaluate=Evaluate(episodes_per_task=8, num_envs=4),
+        demonstrate=Demonstrate(episodes_per_task=1),
+        sft=SFT(steps=20, scale_steps=10, batch_size=8),
+        explore=Explore(episodes_per_task=8, num_envs=8, scale_factors=(1.0,)),
+        world_model=WorldModel(steps=10, batch_size=2),
+        reflector=Reflector(encoder_steps=8, steps=10, batch_size=4),
+        post_train=PostTrain(iterations=3, groups=2, group_size=2, epochs=2, probe_every=2, probe_contexts=2),
+        evaluate=Evaluate(episodes_per_task=2, num_envs=2),
     )
 
 

@@ -54,6 +54,8 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"post_train": PostTrain(ratio_level="foo")}, "ratio_level must be one of step, chunk, got 'foo'"),
         ({"post_train": PostTrain(contexts="hard")}, "contexts must be one of uniform, mixed, got 'hard'"),
         ({"post_train": PostTrain(group_size=1)}, "group_size must be at least 2"),
+        ({"seed": -1}, "seed must be a whole number of at least 0, got -1"),
+        ({"checkpoint_minutes": -1.0}, "checkpoint_minutes must be at least 0, got -1.0"),
         ({"chunk_length": 0}, "chunk_length must be at least 1, got 0"),
         ({"explore": Explore(num_envs=2)}, "explore.num_envs must be at least 3, one for each task, got 2"),
         ({"post_train": PostTrain(env="tabletop", groups=2)}, "post_train.groups must be at least 3, one for each"),
