@@ -154,6 +154,8 @@ class WorldEnvConfig:
     """Of every random choice; demonstrations and initial states stay the same."""
     num_threads: int = 2
     """CPU threads. Beside other jobs 1 is faster: threads that wait for a busy core make all wait."""
+    logger: tuple[str, ...] = ()
+    """Where figures, plots and videos go beside ``metrics.jsonl``: any of csv, tensorboard, wandb, mlflow, mcap."""
     tasks: tuple[str, ...] = GOAL_TASKS
     """``suite/name`` or a ``.bddl`` file, each once; ``task_id`` is the place in this list."""
     cameras: tuple[str, ...] = ("agentview",)

@@ -3,7 +3,7 @@
 ``checkpoints/`` learned parts, ``rollouts/*.mcap`` logged rollouts, ``episodes/`` their frames on disk (a cache),
 ``metrics.jsonl`` one line a measurement, ``plots/*.png``, ``config.yaml`` the exact settings, ``tasks.json`` the
 digest of each task, ``versions.json`` the packages it ran with, ``stages/`` one marker per finished stage,
-``report.html``.
+``report.html``, ``logs/`` what ``--logger`` adds.
 """
 
 from __future__ import annotations
@@ -20,9 +20,12 @@ from typing import Any
 
 import yaml
 
+from loggers import Loggers
 from worldenv_trl.report import machine_versions
 
 MIN_FREE_GB = 1.0
+FREE = {"run_dir", "num_threads", "logger"}
+"""Settings that do not change what a run computes: it may be continued with others."""
 
 
 class RunFolder:
@@ -36,6 +39,7 @@ class RunFolder:
         self.path = Path(path)
         if self.path.exists() and not self.path.is_dir():
             raise NotADirectoryError(f"run_dir must be a folder, {self.path} is a file; choose another --run-dir")
+        self.loggers = Loggers()
 
     @property
     def metrics_path(self) -> Path:
@@ -87,8 +91,7 @@ class RunFolder:
             old = yaml.safe_load(stored.read_text())
             # What has become a setting since then was at its default.
             before, now = _flat(_plain(dataclasses.asdict(type(config)()))) | _flat(old), _flat(new)
-            free = {"run_dir", "num_threads"}
-            changed = [key for key in now if before.get(key) != now[key] and key not in free]
+            changed = [key for key in now if before.get(key) != now[key] and key not in FREE]
             if changed:
                 key, more = changed[0], f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
                 raise ValueError(
@@ -138,17 +141,29 @@ class RunFolder:
         marker.unlink(missing_ok=True)
         kept = [line for line in self.read_metrics() if line["stage"] != name]
         _write_atomically(self.metrics_path, "".join(json.dumps(line) + "\n" for line in kept))
-        started = time.monotonic()
+        started, since = time.monotonic(), time.time()
         yield
         seconds = time.monotonic() - started
         self.log(name, seconds=seconds)
         _write_atomically(marker, f"{seconds:.1f}\n")
+        files = (self.path / "rollouts").glob("*.mcap")
+        self.loggers.recordings(path for path in files if path.stat().st_mtime >= since)
 
     def log(self, stage: str, **values: Any) -> None:
-        """Appends one line to ``metrics.jsonl``."""
-        line = {"stage": stage} | _plain(values)
+        """Appends one line to ``metrics.jsonl``, and gives its numbers to the loggers."""
+        values = _plain(values)
         with self.metrics_path.open("a") as file:
-            file.write(json.dumps(line) + "\n")
+            file.write(json.dumps({"stage": stage} | values) + "\n")
+        self.loggers.log(stage, values)
+
+    def start_logging(self, config: Any) -> None:
+        """Gives what is logged from now on to the loggers ``config.logger``, too, until :attr:`loggers` are closed.
+
+        Raises:
+            ValueError: naming a logger that cannot start.
+        """
+        settings = {key: str(value) for key, value in _flat(_plain(dataclasses.asdict(config))).items()}
+        self.loggers = Loggers.open(config.logger, self.path, settings)
 
     def read_metrics(self, stage: str | None = None) -> list[dict[str, Any]]:
         """The lines of ``metrics.jsonl``, of one stage if named. A last line cut short by a crash is left out."""

@@ -7,6 +7,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
@@ -82,7 +83,9 @@ def run_alone(kind: str, work: Work, arguments: Sequence[str] | None = None, par
     The stages after it, which learned from what it made before, count as not finished from then on.
     """
     config = parse(sys.argv[1:] if arguments is None else arguments, work.__module__)
-    rerun(kind, work, open_run(config, parts))
+    run = open_run(config, parts)
+    with closing(run.folder.loggers):
+        rerun(kind, work, run)
 
 
 def rerun(kind: str, work: Work, run: Run) -> None:
@@ -111,6 +114,7 @@ def open_run(config: WorldEnvConfig, parts: Parts = COMPACT) -> Run:
         check_config(config, parts)
         folder = RunFolder(config.run_dir)
         folder.open(config, {task: load_task(task).digest for task in config.tasks})
+        folder.start_logging(config)
     except (ValueError, OSError, RuntimeError) as error:
         raise SystemExit(f"error: {error}") from error
     torch.set_num_threads(config.num_threads)
