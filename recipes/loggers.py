@@ -240,12 +240,12 @@ class Loggers:
         step = values.get("step")
         if step is None:
             step, self._lines[tuple(numbers)] = self._lines[tuple(numbers)], self._lines[tuple(numbers)] + 1
-        self._each(lambda kind, logger: logger.log_metrics(numbers, step=step))
+        self._each(lambda kind: _log, numbers, step)
 
     def images(self, paths: Iterable[Path]) -> None:
         """Pictures, each under the name of its folder and file."""
         for path in sorted(paths):
-            self._each(lambda kind, logger, path=path: kind.image(logger, f"{path.parent.name}/{path.stem}", path))
+            self._each(lambda kind: kind.image, f"{path.parent.name}/{path.stem}", path)
 
     def recordings(self, paths: Iterable[Path]) -> None:
         """The first rollout of each recording as a video of every camera."""
@@ -258,26 +258,30 @@ class Loggers:
             frame = torch.arange(int(episode["length"][0]) + 1)
             for camera in episode.cameras:
                 video, name = episode.frames(camera, torch.zeros_like(frame), frame), f"videos/{path.stem}_{camera}"
-                self._each(lambda kind, logger, name=name, video=video: kind.video(logger, name, video))
+                self._each(lambda kind: kind.video, name, video)
 
     def page(self, path: Path) -> None:
         """An HTML file, if it is there."""
         if not path.is_file():
             return
-        self._each(lambda kind, logger: kind.page(logger, f"report/{path.stem}", path))
+        self._each(lambda kind: kind.page, f"report/{path.stem}", path)
 
     def close(self) -> None:
         """Completes what the loggers write."""
-        self._each(lambda kind, logger: kind.close(logger))
+        self._each(lambda kind: kind.close)
         self.loggers.clear()
 
-    def _each(self, what: Callable[[Kind, Logger], object]) -> None:
+    def _each(self, take: Callable[[Kind], Callable[..., None]], *what: Any) -> None:
         for name, logger in list(self.loggers.items()):
             try:
-                what(KINDS[name], logger)
+                take(KINDS[name])(logger, *what)
             except Exception as error:  # its server is gone, the disk is full, ...
                 del self.loggers[name]
                 print(f"warning: the logger {name} failed and is left out: {_said(error)}", file=sys.stderr)
+
+
+def _log(logger: Logger, numbers: dict[str, float], step: int) -> None:
+    logger.log_metrics(numbers, step=step)
 
 
 def _in_a_name(text: str) -> str:

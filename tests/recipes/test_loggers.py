@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import os
 import struct
 
@@ -126,11 +127,14 @@ def test_tensorboard_shows_scalars_and_pictures(tmp_path, recording):
     log_something(folder)
     folder.loggers.images([picture(folder)])
     folder.loggers.recordings([recording[0]])
+    assert set(folder.loggers.loggers) == {"tensorboard"}  # nothing of this has failed
     folder.loggers.close()
     events = EventAccumulator(str(folder.path / "logs" / "001" / "tensorboard"), size_guidance={"images": 0})
     events.Reload()
     assert [(each.step, each.value) for each in events.Scalars(NAME)] == [(0, 0.25), (1, 0.5)]
-    assert "plots/losses" in events.Tags()["images"] and "settings/text_summary" in events.Tags()["tensors"]
+    videos = ["videos/demo_agentview", "videos/demo_wrist"] if importlib.util.find_spec("moviepy") else []
+    assert sorted(events.Tags()["images"]) == ["plots/losses", *videos]
+    assert "settings/text_summary" in events.Tags()["tensors"]
 
 
 def test_mlflow_writes_to_the_run_folder(tmp_path, recording, monkeypatch):
