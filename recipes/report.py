@@ -11,12 +11,12 @@ import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 import tyro
 
 from command_line import in_options
 from gather_evidence import gather, short
 from parts import COMPACT, Parts
+from threads import use_threads
 from worldenv_trl.report import Evidence, RunRecord, write_report
 
 
@@ -63,7 +63,7 @@ def write(settings: Report, parts: Parts = COMPACT) -> Path:
             "episodes-per-task must be at least 1 and clips-per-kind at least 0, "
             f"got {settings.episodes_per_task} and {settings.clips_per_kind}"
         )
-    torch.set_num_threads(settings.num_threads)
+    use_threads(settings.num_threads)
     evidence = None
     if settings.models:
         try:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
-import torch
 import tyro
 from tqdm import tqdm
 
@@ -21,6 +20,7 @@ from config import PRESETS, WorldEnvConfig
 from parts import COMPACT, Parts
 from run import Run
 from run_folder import RunFolder
+from threads import use_threads
 from worldenv_trl.scenes import load_task
 
 Work = Callable[..., None]
@@ -117,7 +117,7 @@ def open_run(config: WorldEnvConfig, parts: Parts = COMPACT) -> Run:
         folder.start_logging(config)
     except (ValueError, OSError, RuntimeError) as error:
         raise SystemExit(f"error: {error}") from error
-    torch.set_num_threads(config.num_threads)
+    use_threads(config.num_threads)
     return Run(config, folder, parts)
 
 
