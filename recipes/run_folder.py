@@ -3,7 +3,7 @@
 ``checkpoints/`` learned parts, ``rollouts/*.mcap`` logged rollouts, ``episodes/`` their frames on disk (a cache),
 ``metrics.jsonl`` one line a measurement, ``plots/*.png``, ``config.yaml`` the exact settings, ``tasks.json`` the
 digest of each task, ``versions.json`` the packages it ran with, ``stages/`` one marker per finished stage,
-``report.html``, ``logs/`` what ``--logger`` adds.
+``report.html``, ``logs/`` what ``--logger`` adds, ``error.txt`` the traceback of the last error of a stage.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import json
 import os
 import shutil
 import time
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -155,6 +156,15 @@ class RunFolder:
         with self.metrics_path.open("a") as file:
             file.write(json.dumps({"stage": stage} | values) + "\n")
         self.loggers.log(stage, values)
+
+    def keep_traceback(self, error: BaseException) -> Path | None:
+        """Writes ``error.txt``, the last traceback; None if the disk takes no more."""
+        path = self.path / "error.txt"
+        try:
+            _write_atomically(path, "".join(traceback.format_exception(error)))
+        except OSError:
+            return None
+        return path
 
     def start_logging(self, config: Any) -> None:
         """Gives what is logged from now on to the loggers ``config.logger``, too, until :attr:`loggers` are closed.

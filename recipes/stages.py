@@ -16,6 +16,7 @@ import tyro
 from tqdm import tqdm
 
 from checks import check_config
+from command_line import expected, in_options, refusals
 from config import PRESETS, WorldEnvConfig
 from parts import COMPACT, Parts
 from run import Run
@@ -110,13 +111,11 @@ def parse(arguments: Sequence[str], module: str = "__main__") -> WorldEnvConfig:
 
 def open_run(config: WorldEnvConfig, parts: Parts = COMPACT) -> Run:
     """The run of checked settings; what is wrong with them is said in one line."""
-    try:
+    with refusals():
         check_config(config, parts)
         folder = RunFolder(config.run_dir)
         folder.open(config, {task: load_task(task).digest for task in config.tasks})
         folder.start_logging(config)
-    except (ValueError, OSError, RuntimeError) as error:
-        raise SystemExit(f"error: {error}") from error
     use_threads(config.num_threads)
     return Run(config, folder, parts)
 
@@ -126,7 +125,7 @@ def _finished(stage: Stage, folder: RunFolder) -> bool:
 
 
 def _run(stage: Stage, work: Work, run: Run) -> None:
-    """Runs a stage; Ctrl-C ends the program with one line, wherever it strikes."""
+    """Runs a stage; Ctrl-C ends the program with one line, wherever it strikes, and so does an expected error."""
     interrupted = threading.Event()
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -139,11 +138,13 @@ def _run(stage: Stage, work: Work, run: Run) -> None:
         with run.folder.stage(stage.name), warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: tqdm.write(f"warning: {message}", file=sys.stderr)
             work(run, **stage.options)
-    except FileNotFoundError as error:
-        raise SystemExit(f"error: {error}") from error
     except BaseException as error:
         if not interrupted.is_set():
-            raise
+            if not isinstance(error, Exception) or not expected(error):
+                raise
+            kept = run.folder.keep_traceback(error)
+            where = "" if kept is None else f" (stage {stage.name}; where it was raised: {kept})"
+            raise SystemExit(f"error: {in_options(error)}{where}") from error
         # Libraries may have turned the KeyboardInterrupt into an error of their own.
         message = f"interrupted in stage {stage.name}: the same command continues"
         raise SystemExit(f"\n{message}, finished stages are kept") from error

@@ -27,6 +27,10 @@ else:
     _Module = object
 
 
+class OtherClassError(ValueError):
+    """A checkpoint holds a part of another class."""
+
+
 class Pretrained(_Module):
     """Gives an ``nn.Module`` ``save_pretrained(folder)``, ``from_pretrained(folder or id)`` and ``push_to_hub(id)``.
 
@@ -170,7 +174,9 @@ def _read_config(path: Path, class_name: str) -> tuple[dict, str | None]:
             f"{path} is not a complete checkpoint config ({error!r}): restore it or train again"
         ) from error
     if saved_class != class_name:
-        raise ValueError(f"{path.parent} holds a {saved_class}, not a {class_name}: use {saved_class}.from_pretrained")
+        raise OtherClassError(
+            f"{path.parent} holds a {saved_class}, not a {class_name}: use {saved_class}.from_pretrained"
+        )
     return fields, config.get("weights_sha256")
 
 
