@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from config import WorldEnvConfig
+from loggers import check_loggers
 from parts import COMPACT, Parts
 from physics import tabletop
 from worldenv_trl.reflectors import StopRule
@@ -100,6 +101,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         raise ValueError(f"image_size must be a multiple of 16 px and at least 32, got {config.image_size}")
     if config.max_steps < 1 or config.max_steps % config.chunk_length:
         raise ValueError(f"max_steps must be a multiple of chunk_length={config.chunk_length}, got {config.max_steps}")
+    check_loggers(config.logger)
     digests: dict[str, str] = {}
     for name in config.tasks:
         digest = load_task(name).digest

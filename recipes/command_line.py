@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import dis
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
+from pathlib import Path
 from typing import ParamSpec
 
+import worldenv_trl
+
 P = ParamSpec("P")
+
+_OURS = tuple(f"{Path(file).resolve().parent}{os.sep}" for file in (__file__, worldenv_trl.__file__))
+_RAISE = dis.opmap["RAISE_VARARGS"]
 
 _OPTIONS = (
     ("pass overwrite=True", "pass --overwrite"),
@@ -23,7 +31,7 @@ _OPTIONS = (
 
 
 def one_line_errors(main: Callable[P, int | None]) -> Callable[P, int]:
-    """``main`` with errors and warnings as lines on stderr; returns 1 after an error."""
+    """``main`` with :func:`expected` errors and warnings as lines on stderr; returns 1 after an error."""
 
     @wraps(main)
     def run(*arguments: P.args, **options: P.kwargs) -> int:
@@ -31,7 +39,9 @@ def one_line_errors(main: Callable[P, int | None]) -> Callable[P, int]:
             warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
             try:
                 return main(*arguments, **options) or 0
-            except (ValueError, OSError, ImportError) as error:
+            except Exception as error:
+                if not expected(error):
+                    raise
                 print(f"error: {in_options(error)}", file=sys.stderr)
                 return 1
 
@@ -40,11 +50,32 @@ def one_line_errors(main: Callable[P, int | None]) -> Callable[P, int]:
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Turns errors about settings, files and placements into ``SystemExit("error: ...")``."""
+    """Turns :func:`expected` errors into ``SystemExit("error: ...")``."""
     try:
         yield
-    except (ValueError, OSError, RuntimeError) as error:
+    except Exception as error:
+        if not expected(error):
+            raise
         raise SystemExit(f"error: {in_options(error)}") from error
+
+
+def expected(error: Exception) -> bool:
+    """Whether an error is about settings, files or the machine, so that one line is enough: no programming error.
+
+    It is if a ``raise`` of this project made it, which knows what is wrong, or the system says it of a file or disk.
+    The same ``ValueError`` out of a library, or of a line that raises nothing itself, is a mistake of the program.
+    """
+    if isinstance(error, OSError) and error.errno is not None and not isinstance(error, ConnectionError):
+        return True
+    if not isinstance(error, ValueError | OSError | RuntimeError | ImportError):
+        return False
+    where = error.__traceback__
+    while where is not None and where.tb_next is not None:
+        where = where.tb_next
+    if where is None:
+        return False
+    code = where.tb_frame.f_code
+    return code.co_filename.startswith(_OURS) and code.co_code[where.tb_lasti] == _RAISE
 
 
 def at_least(low: int, **settings: int | tuple[int, ...]) -> None:

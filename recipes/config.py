@@ -156,6 +156,8 @@ class WorldEnvConfig:
     """CPU threads. Beside other jobs 1 is faster: threads that wait for a busy core make all wait."""
     checkpoint_minutes: float = 2.0
     """Between two checkpoints of the running stage: at most so much is lost when it is killed."""
+    logger: tuple[str, ...] = ()
+    """Where figures, plots and videos go beside ``metrics.jsonl``: any of csv, tensorboard, wandb, mlflow, mcap."""
     tasks: tuple[str, ...] = GOAL_TASKS
     """``suite/name`` or a ``.bddl`` file, each once; ``task_id`` is the place in this list."""
     cameras: tuple[str, ...] = ("agentview",)

@@ -20,6 +20,7 @@ from command_line import at_least, refusals
 from gather_evidence import read_config
 from run import Run
 from run_folder import RunFolder
+from threads import use_threads
 from two_worlds import TwoWorlds, imagine, live
 from worldenv_trl import keys
 from worldenv_trl.policies import laplace_actor
@@ -46,11 +47,11 @@ def main(settings: Settings) -> None:
     with refusals():
         at_least(2, columns=settings.columns)
         at_least(0, state=settings.state)
+        use_threads(settings.num_threads)
         config = read_config(RunRecord.read(settings.run), settings.num_threads)
         run = Run(config, RunFolder(settings.run))
         models = run.world_model(), run.reflector(), run.rules()
         actor = laplace_actor(run.policy(settings.policy).eval())
-    torch.set_num_threads(settings.num_threads)
     count = settings.state + 1
     episodes = live(run, actor, count)
     rows = torch.arange(len(config.tasks)) * count + settings.state

@@ -101,6 +101,7 @@ def read_config(record: RunRecord, num_threads: int) -> WorldEnvConfig:
     """The run's settings; one that this release does not know is left out.
 
     Raises:
+        FileNotFoundError: naming a task file that is not found from here.
         ValueError: naming a task that this release does not have.
     """
     config = dataclasses.replace(_filled(WorldEnvConfig(), record.config), run_dir=record.path, num_threads=num_threads)
@@ -108,6 +109,11 @@ def read_config(record: RunRecord, num_threads: int) -> WorldEnvConfig:
         try:
             load_task(task)
         except (ValueError, OSError) as error:
+            if task.endswith(".bddl") and not Path(task).exists():
+                raise FileNotFoundError(
+                    f"there is no task file {Path(task).resolve()}: the run was made with {task!r}; call this from the "
+                    "folder that it was made from, or put the file there"
+                ) from error
             raise ValueError(
                 f"the run's task {task!r} is not one of this release ({error}). {_remedy(record)}"
             ) from error

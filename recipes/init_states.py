@@ -15,6 +15,7 @@ import tyro
 
 from command_line import at_least, refusals
 from task_names import SUITES, named_tasks
+from threads import use_threads
 from worldenv_trl.scenes import SceneBatch, ScriptedExpert, Task, load_task
 from worldenv_trl.scenes.initial import save_poses
 
@@ -28,11 +29,13 @@ class Settings:
     count: int = 50
     """States of each split."""
     processes: int = 2
+    """One thread each."""
 
 
 def main(settings: Settings) -> None:
     with refusals():
         at_least(1, count=settings.count, processes=settings.processes)
+        use_threads(1)
         names = named_tasks(settings.tasks)
         for name in names:
             ScriptedExpert(load_task(name))  # what it has no skill for is said before anything is drawn

@@ -11,12 +11,13 @@ import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 import tyro
 
-from command_line import in_options
+from command_line import refusals
 from gather_evidence import gather, short
 from parts import COMPACT, Parts
+from threads import use_threads
+from worldenv_trl.pretrained import OtherClassError
 from worldenv_trl.report import Evidence, RunRecord, write_report
 
 
@@ -38,10 +39,8 @@ class Report:
 
 
 def main(settings: Report) -> Path:
-    try:
+    with refusals():
         out = write(settings)
-    except (OSError, ValueError) as error:
-        raise SystemExit(f"error: {in_options(error)}") from error
     if settings.show:
         webbrowser.open(out.resolve().as_uri())
     return out
@@ -63,12 +62,15 @@ def write(settings: Report, parts: Parts = COMPACT) -> Path:
             "episodes-per-task must be at least 1 and clips-per-kind at least 0, "
             f"got {settings.episodes_per_task} and {settings.clips_per_kind}"
         )
-    torch.set_num_threads(settings.num_threads)
+    use_threads(settings.num_threads)
     evidence = None
     if settings.models:
         try:
             counts = settings.episodes_per_task, settings.clips_per_kind
             evidence = gather(record, *counts, settings.num_threads, parts)
+        except OtherClassError as error:
+            own = "parts of your own are passed as recipes/README.md says: report.write(report.Report(folder), parts)"
+            evidence = Evidence(missing=[f"{short(error)}; {own}"])
         except (OSError, ValueError, RuntimeError) as error:  # the logged figures are shown all the same
             evidence = Evidence(missing=[short(error)])
         for what in evidence.missing:

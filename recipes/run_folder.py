@@ -3,8 +3,9 @@
 ``checkpoints/`` learned parts, ``rollouts/*.mcap`` logged rollouts, ``episodes/`` their frames on disk (a cache),
 ``metrics.jsonl`` one line a measurement, ``plots/*.png``, ``config.yaml`` the exact settings, ``tasks.json`` the
 digest of each task, ``versions.json`` the packages it ran with, ``stages/`` one marker per finished stage,
-``report.html``; while a stage runs, ``resume/<stage>/`` from where it would continue (:mod:`resumable`) and
-``scratch/``. ``run.lock`` keeps a second run out.
+``report.html``, ``logs/`` what ``--logger`` adds, ``error.txt`` the traceback of the last error of a stage; while a
+stage runs, ``resume/<stage>/`` from where it would continue (:mod:`resumable`) and ``scratch/``. ``run.lock`` keeps a
+second run out.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import json
 import os
 import shutil
 import time
+import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,10 +24,12 @@ from typing import Any
 import yaml
 
 from folder_lock import FolderLock, lock_folder
+from loggers import Loggers
 from worldenv_trl.report import machine_versions
 
 MIN_FREE_GB = 1.0
-_FREE_SETTINGS = {"run_dir", "num_threads", "checkpoint_minutes"}  # the result is the same
+FREE = {"run_dir", "num_threads", "checkpoint_minutes", "logger"}
+"""Settings that do not change what a run computes: it may be continued with others."""
 
 
 class RunFolder:
@@ -46,6 +50,7 @@ class RunFolder:
         self._seconds = 0.0  # that the running stage has taken before this process
         self._started = 0.0
         self._lock: FolderLock | None = None
+        self.loggers = Loggers()
 
     @property
     def metrics_path(self) -> Path:
@@ -111,7 +116,7 @@ class RunFolder:
             old = yaml.safe_load(stored.read_text())
             # What has become a setting since then was at its default.
             before, now = _flat(_plain(dataclasses.asdict(type(config)()))) | _flat(old), _flat(new)
-            changed = [key for key in now if before.get(key) != now[key] and key not in _FREE_SETTINGS]
+            changed = [key for key in now if before.get(key) != now[key] and key not in FREE]
             if changed:
                 key, more = changed[0], f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
                 raise ValueError(
@@ -166,7 +171,7 @@ class RunFolder:
             self.forget(name)
         shutil.rmtree(self.path / "scratch", ignore_errors=True)
         outer = self.running, self._started, self._seconds
-        self.running, self._started = name, time.monotonic()
+        self.running, self._started, since = name, time.monotonic(), time.time()
         self.restore_stage(name, 0.0, [])
         try:
             yield
@@ -174,6 +179,8 @@ class RunFolder:
             self.log(name, seconds=seconds)
             # Marked first: a crash in between leaves checkpoints that nobody reads.
             _write_atomically(self.path / "stages" / name, f"{seconds:.1f}\n")
+            files = (self.path / "rollouts").glob("*.mcap")
+            self.loggers.recordings(path for path in files if path.stat().st_mtime >= since)
             shutil.rmtree(self.progress(name), ignore_errors=True)
             shutil.rmtree(self.path / "scratch", ignore_errors=True)
         finally:
@@ -190,10 +197,29 @@ class RunFolder:
         _write_atomically(self.metrics_path, "".join(json.dumps(line) + "\n" for line in [*kept, *lines]))
 
     def log(self, stage: str, **values: Any) -> None:
-        """Appends one line to ``metrics.jsonl``."""
-        line = {"stage": stage} | _plain(values)
+        """Appends one line to ``metrics.jsonl``, and gives its numbers to the loggers."""
+        values = _plain(values)
         with self.metrics_path.open("a") as file:
-            file.write(json.dumps(line) + "\n")
+            file.write(json.dumps({"stage": stage} | values) + "\n")
+        self.loggers.log(stage, values)
+
+    def keep_traceback(self, error: BaseException) -> Path | None:
+        """Writes ``error.txt``, the last traceback; None if the disk takes no more."""
+        path = self.path / "error.txt"
+        try:
+            _write_atomically(path, "".join(traceback.format_exception(error)))
+        except OSError:
+            return None
+        return path
+
+    def start_logging(self, config: Any) -> None:
+        """Gives what is logged from now on to the loggers ``config.logger``, too, until :attr:`loggers` are closed.
+
+        Raises:
+            ValueError: naming a logger that cannot start.
+        """
+        settings = {key: str(value) for key, value in _flat(_plain(dataclasses.asdict(config))).items()}
+        self.loggers = Loggers.open(config.logger, self.path, settings)
 
     def read_metrics(self, stage: str | None = None) -> list[dict[str, Any]]:
         """The lines of ``metrics.jsonl``, of one stage if named. A last line cut short by a crash is left out."""

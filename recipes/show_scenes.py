@@ -18,6 +18,7 @@ from torchrl.envs.utils import step_mdp
 
 from command_line import at_least, refusals
 from task_names import SUITES
+from threads import use_threads
 from worldenv_trl import keys
 from worldenv_trl.context_ids import SPLITS
 from worldenv_trl.envs import ExpertPolicy, TabletopEnv
@@ -42,11 +43,13 @@ class Sheet:
     """Each pixel is drawn this many times wide and high."""
     moments: tuple[float, ...] = (0.0, 0.3, 1.0)
     """Rows of each task, as shares of its longest episode."""
+    num_threads: int = 2
 
 
 def main(settings: Sheet) -> None:
     with refusals():
         check(settings)
+        use_threads(settings.num_threads)
     names = task_names(settings.suite)
     rows, broken = [], []
     for name in names:

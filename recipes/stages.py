@@ -7,20 +7,21 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
-import torch
 import tyro
 from tqdm import tqdm
 
 from checks import check_config
+from command_line import expected, in_options, refusals
 from config import PRESETS, WorldEnvConfig
 from parts import COMPACT, Parts
-from resumable import NotResumable
 from run import Run
 from run_folder import RunFolder
+from threads import use_threads
 from worldenv_trl.scenes import load_task
 
 Work = Callable[..., None]
@@ -84,7 +85,9 @@ def run_alone(kind: str, work: Work, arguments: Sequence[str] | None = None, par
     The stages after it, which learned from what it made before, count as not finished from then on.
     """
     config = parse(sys.argv[1:] if arguments is None else arguments, work.__module__)
-    rerun(kind, work, open_run(config, parts))
+    run = open_run(config, parts)
+    with closing(run.folder.loggers):
+        rerun(kind, work, run)
 
 
 def rerun(kind: str, work: Work, run: Run) -> None:
@@ -109,13 +112,12 @@ def parse(arguments: Sequence[str], module: str = "__main__") -> WorldEnvConfig:
 
 def open_run(config: WorldEnvConfig, parts: Parts = COMPACT) -> Run:
     """The run of checked settings; what is wrong with them is said in one line."""
-    try:
+    with refusals():
         check_config(config, parts)
         folder = RunFolder(config.run_dir)
         folder.open(config, {task: load_task(task).digest for task in config.tasks})
-    except (ValueError, OSError, RuntimeError) as error:
-        raise SystemExit(f"error: {error}") from error
-    torch.set_num_threads(config.num_threads)
+        folder.start_logging(config)
+    use_threads(config.num_threads)
     return Run(config, folder, parts)
 
 
@@ -124,7 +126,7 @@ def _finished(stage: Stage, folder: RunFolder) -> bool:
 
 
 def _run(stage: Stage, work: Work, run: Run) -> None:
-    """Runs a stage; Ctrl-C ends the program with one line, wherever it strikes."""
+    """Runs a stage; Ctrl-C ends the program with one line, wherever it strikes, and so does an expected error."""
     interrupted = threading.Event()
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -137,11 +139,13 @@ def _run(stage: Stage, work: Work, run: Run) -> None:
         with run.folder.stage(stage.name), warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: tqdm.write(f"warning: {message}", file=sys.stderr)
             work(run, **stage.options)
-    except (FileNotFoundError, NotResumable) as error:
-        raise SystemExit(f"error: {error}") from error
     except BaseException as error:
         if not interrupted.is_set():
-            raise
+            if not isinstance(error, Exception) or not expected(error):
+                raise
+            kept = run.folder.keep_traceback(error)
+            where = "" if kept is None else f" (stage {stage.name}; where it was raised: {kept})"
+            raise SystemExit(f"error: {in_options(error)}{where}") from error
         # Libraries may have turned the KeyboardInterrupt into an error of their own.
         message = f"interrupted in stage {stage.name}: the same command continues"
         raise SystemExit(f"\n{message}, finished stages are kept") from error

@@ -13,6 +13,7 @@ checkpoint, to the same weights bit for bit.
 from __future__ import annotations
 
 import sys
+from contextlib import closing
 
 import report
 from config import WorldEnvConfig
@@ -21,6 +22,7 @@ from evaluate import evaluate
 from explore import explore
 from parts import COMPACT, Parts
 from post_train import post_train
+from run import Run
 from sft import fine_tune
 from stages import Work, open_run, parse, run_stages
 from train_reflector import train_reflector
@@ -41,9 +43,16 @@ WORKS: dict[str, Work] = {
 def run_all(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     """Runs what is not finished yet, then prints the table and writes the plots and the report."""
     run = open_run(config, parts)
-    run_stages(run, WORKS)
-    folder = run.folder.path
-    plot_run(folder)
+    with closing(run.folder.loggers) as loggers:
+        run_stages(run, WORKS)
+        loggers.images(plot_run(run.folder.path))
+        summarize(run)
+        loggers.page(run.folder.path / "report.html")
+
+
+def summarize(run: Run) -> None:
+    """Prints the table and writes the report."""
+    config, folder = run.config, run.folder.path
     print(summary_table(folder))
     print(
         "Success in %, [95 % Wilson intervals], p of an exact McNemar test on the same initial states. "
@@ -52,7 +61,7 @@ def run_all(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     episodes = max(min(config.evaluate.episodes_per_task // 5, report.Report.episodes_per_task), 1)
     settings = report.Report(folder, episodes_per_task=episodes, num_threads=config.num_threads)
     try:
-        report.write(settings, parts)
+        report.write(settings, run.parts)
     except Exception as error:  # the run itself is whole
         again = f"python recipes/report.py {folder}"
         print(f"warning: the report could not be written ({error}); after a remedy: {again}", file=sys.stderr)

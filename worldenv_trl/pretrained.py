@@ -1,4 +1,4 @@
-"""Saving and loading of learned parts: a plain config file beside a safetensors file."""
+"""Saving and loading of learned parts: a plain config file beside a safetensors file, in a folder or on the Hub."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -13,6 +14,8 @@ import numpy as np
 import safetensors
 import safetensors.torch
 import torch
+
+from worldenv_trl import hub
 
 CONFIG_NAME = "config.json"
 WEIGHTS_NAME = "model.safetensors"
@@ -24,8 +27,12 @@ else:
     _Module = object
 
 
+class OtherClassError(ValueError):
+    """A checkpoint holds a part of another class."""
+
+
 class Pretrained(_Module):
-    """Gives an ``nn.Module`` ``save_pretrained(folder)`` and ``from_pretrained(folder)``.
+    """Gives an ``nn.Module`` ``save_pretrained(folder)``, ``from_pretrained(folder or id)`` and ``push_to_hub(id)``.
 
     The module is built from one dataclass: ``__init__(self, config)`` accepts an instance of :attr:`config_class`
     alone and keeps it as ``self.config``. Parameters and persistent buffers are saved. A config is written with
@@ -84,20 +91,59 @@ class Pretrained(_Module):
                 path.unlink(missing_ok=True)
         return folder
 
-    @classmethod
-    def from_pretrained(cls, folder: str | os.PathLike, *, device: str | torch.device = "cpu") -> Self:
-        """Rebuilds the module that :meth:`save_pretrained` wrote to ``folder``.
+    def push_to_hub(
+        self,
+        repo_id: str,
+        *,
+        private: bool | None = None,
+        revision: str | None = None,
+        commit_message: str | None = None,
+    ) -> str:
+        """Uploads what :meth:`save_pretrained` writes to the Hugging Face Hub; returns the address of the commit.
+
+        Args:
+            repo_id: ``owner/name``; made if it does not exist.
+
+        Keyword Args:
+            private: of a new repository; the owner's default when None.
+            revision: branch, made if it does not exist; ``main`` when None.
+            commit_message: names the class when None.
 
         Raises:
-            FileNotFoundError: if the folder or one of its two files is missing.
+            ValueError: if ``repo_id`` is not ``owner/name``.
+            OSError: if the Hub refuses or cannot be reached.
+        """
+        message = f"Upload a {type(self).__name__} of worldenv_trl" if commit_message is None else commit_message
+        with tempfile.TemporaryDirectory() as folder:
+            self.save_pretrained(folder)
+            return hub.upload(folder, repo_id, private=private, revision=revision, message=message)
+
+    @classmethod
+    def from_pretrained(
+        cls, name: str | os.PathLike, *, device: str | torch.device = "cpu", revision: str | None = None
+    ) -> Self:
+        """Rebuilds the module that :meth:`save_pretrained` wrote to a folder, or :meth:`push_to_hub` to the Hub.
+
+        Args:
+            name: a folder, or ``owner/name`` of a repository. What exists on this machine always wins, and the Hub is
+                asked for nothing but text that can be no path: see :func:`~worldenv_trl.hub.is_repo_id`.
+
+        Keyword Args:
+            device: of the parameters.
+            revision: branch, tag or commit of a repository; ``main`` when None.
+
+        Raises:
+            FileNotFoundError: if the folder, one of its two files or the repository is missing.
             ValueError: if the checkpoint is truncated, corrupt, or of another class or shape.
         """
-        folder = Path(folder)
+        remote = hub.is_repo_id(name)
+        folder = hub.download(str(name), [CONFIG_NAME, WEIGHTS_NAME], revision=revision) if remote else Path(name)
         for path in (folder, folder / CONFIG_NAME, folder / WEIGHTS_NAME):
             if not path.exists():
+                writes = "repository that push_to_hub" if remote else f"folder that {cls.__name__}.save_pretrained"
                 raise FileNotFoundError(
-                    f"no {cls.__name__} checkpoint at {folder}: {path} is missing. "
-                    f"Name a folder that {cls.__name__}.save_pretrained wrote."
+                    f"no {cls.__name__} checkpoint at {name}: {path.name if remote else path} is missing. "
+                    f"Name a {writes} wrote."
                 )
         fields, digest = _read_config(folder / CONFIG_NAME, cls.__name__)
         try:
@@ -128,7 +174,9 @@ def _read_config(path: Path, class_name: str) -> tuple[dict, str | None]:
             f"{path} is not a complete checkpoint config ({error!r}): restore it or train again"
         ) from error
     if saved_class != class_name:
-        raise ValueError(f"{path.parent} holds a {saved_class}, not a {class_name}: use {saved_class}.from_pretrained")
+        raise OtherClassError(
+            f"{path.parent} holds a {saved_class}, not a {class_name}: use {saved_class}.from_pretrained"
+        )
     return fields, config.get("weights_sha256")
 
 

@@ -7,6 +7,7 @@ random bit is flipped, and what can still be read is compared with what was reco
 from __future__ import annotations
 
 import random
+import sys
 import tempfile
 import warnings
 from dataclasses import dataclass
@@ -16,6 +17,10 @@ import torch
 import tyro
 from tensordict import TensorDict
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the recipes beside this folder
+
+from command_line import refusals
+from threads import use_threads
 from worldenv_trl import keys
 from worldenv_trl.envs import TabletopEnv
 from worldenv_trl.record import (
@@ -41,6 +46,7 @@ class Benchmark:
     rows: int = 16
     steps: int = 20
     seed: int = 0
+    num_threads: int = 1
 
 
 @dataclass
@@ -62,7 +68,7 @@ class Damage:
 def record(folder: Path, rows: int, steps: int) -> tuple[dict[str, Path], TensorDict]:
     """The two files, and the rollouts [rows, steps] that both hold."""
     files = {kind: folder / f"{kind}.mcap" for kind in ("finished rollouts", "a recorded env")}
-    env = TabletopEnv(TASK, rows, seed=0, terminate_on_success=False, num_threads=1)
+    env = TabletopEnv(TASK, rows, seed=0, terminate_on_success=False)
     described = provenance(env)
     env = recorded(env, files["a recorded env"], **described)
     torch.manual_seed(0)
@@ -117,6 +123,8 @@ def _judge(path: Path, rollouts: TensorDict, described: tuple[dict, dict], found
 
 
 def main(settings: Benchmark) -> None:
+    with refusals():
+        use_threads(settings.num_threads)
     with tempfile.TemporaryDirectory() as name:
         files, rollouts = record(Path(name), settings.rows, settings.steps)
         for kind, path in files.items():

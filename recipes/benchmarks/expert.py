@@ -19,6 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the recipes besi
 
 from command_line import at_least, refusals
 from task_names import SUITES, named_tasks
+from threads import use_threads
 from worldenv_trl.context_ids import SPLITS
 from worldenv_trl.metrics import wilson_interval
 from worldenv_trl.scenes import SceneBatch, ScriptedExpert, list_suites, load_task
@@ -33,11 +34,14 @@ class Settings:
     count: int = 50
     """Initial states of each split."""
     processes: int = 2
+    num_threads: int = 1
+    """Of each process."""
 
 
 def main(settings: Settings) -> None:
     with refusals():
         at_least(1, count=settings.count, processes=settings.processes)
+        use_threads(settings.num_threads)
         tasks = named_tasks(settings.tasks or list_suites())
         for name in settings.tasks:
             if name not in SUITES:
@@ -45,7 +49,9 @@ def main(settings: Settings) -> None:
                 ScriptedExpert(task), task.init_states("train", 1)
     start = time.perf_counter()
     with multiprocessing.get_context("spawn").Pool(settings.processes) as pool:
-        results = pool.starmap(count_successes, [(name, settings.count) for name in tasks], chunksize=1)
+        results = pool.starmap(
+            count_successes, [(name, settings.count, settings.num_threads) for name in tasks], chunksize=1
+        )
     seconds = time.perf_counter() - start
     print("| task | solved | steps, median | steps, 95 % | not solved |\n|---|---|---|---|---|")
     for name, lengths in zip(tasks, results, strict=True):
@@ -59,11 +65,11 @@ def main(settings: Settings) -> None:
     print(f"in {seconds:.0f} s, {(np.abs(everything)).sum() / seconds:.0f} control steps a second")
 
 
-def count_successes(name: str, count: int) -> np.ndarray:
+def count_successes(name: str, count: int, num_threads: int) -> np.ndarray:
     """``[2 * count]``: steps to success of each initial state, training ones first; minus those taken if in vain."""
     task = load_task(name)
     states = np.concatenate([task.init_states(split, count) for split in SPLITS])
-    scene, expert = SceneBatch(task, len(states), cameras=(), num_threads=1), ScriptedExpert(task)
+    scene, expert = SceneBatch(task, len(states), cameras=(), num_threads=num_threads), ScriptedExpert(task)
     scene.reset(np.arange(len(states)), states)
     lengths = np.full(len(states), -task.max_steps)
     for step in range(1, task.max_steps + 1):

@@ -54,6 +54,7 @@ from real_groups import Draw, RealGroups, check_draw, real_groups
 from run import Run, read_rules
 from run_folder import RunFolder
 from seeds import stage_seed
+from threads import use_threads
 from worldenv_trl.data import Episodes
 from worldenv_trl.metrics import Estimate
 from worldenv_trl.record.mcap.provenance import model_hash
@@ -100,9 +101,9 @@ class Settings:
 
 def main(settings: Settings) -> Path:
     with refusals():
-        at_least(1, resamples=settings.resamples, num_threads=settings.num_threads)
+        at_least(1, resamples=settings.resamples)
         at_least(2, shown_chunks=settings.shown_chunks or (2,))
-        torch.set_num_threads(settings.num_threads)
+        use_threads(settings.num_threads)
         config = read_config(RunRecord.read(settings.run), settings.num_threads)
         run = Run(config, RunFolder(settings.run))
         factor = config.post_train.scale_factor if settings.scale_factor is None else settings.scale_factor

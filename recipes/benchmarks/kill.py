@@ -10,6 +10,7 @@ import multiprocessing
 import random
 import signal
 import statistics
+import sys
 import tempfile
 import time
 import warnings
@@ -22,6 +23,10 @@ import torch
 import tyro
 from tensordict import TensorDict
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the recipes beside this folder
+
+from command_line import refusals
+from threads import use_threads
 from worldenv_trl import keys
 from worldenv_trl.envs import TabletopEnv
 from worldenv_trl.record import RolloutWriter, read_rollouts, recorded
@@ -45,6 +50,8 @@ class Benchmark:
     """Of the recorded env."""
     within: float = 2.0
     """Seconds after the first step in which the kill comes."""
+    num_threads: int = 1
+    """Of each process."""
 
 
 @dataclass
@@ -62,14 +69,11 @@ class Kills:
 
 
 def make_env(rows: int) -> TabletopEnv:
-    return TabletopEnv(
-        TASK, rows, seed=0, max_steps=EPISODE_STEPS, terminate_on_success=False, with_sim_state=True, num_threads=1
-    )
+    return TabletopEnv(TASK, rows, seed=0, max_steps=EPISODE_STEPS, terminate_on_success=False, with_sim_state=True)
 
 
 def steps_of(env):
     """Endless steps [rows] of random actions, the same ones at every call."""
-    torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(0)
     shown = env.reset()
     while True:
@@ -203,6 +207,8 @@ def kill_writers(kills: int, folder: Path, seed: int = 0) -> Kills:
 
 
 def main(settings: Benchmark) -> None:
+    with refusals():
+        use_threads(settings.num_threads)
     with tempfile.TemporaryDirectory() as name:
         found = kill_recorders(settings.kills, Path(name), settings.rows, settings.within)
         print(f"recorded envs of {settings.rows} rows, killed {settings.kills} times:")

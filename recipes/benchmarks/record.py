@@ -6,6 +6,7 @@ Overhead of a recorder on TabletopEnv, sizes, write and read rates.
 from __future__ import annotations
 
 import statistics
+import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -15,6 +16,10 @@ import torch
 import tyro
 from tensordict import TensorDict
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the recipes beside this folder
+
+from command_line import refusals
+from threads import use_threads
 from worldenv_trl import keys
 from worldenv_trl.envs import TabletopEnv
 from worldenv_trl.kinematics import ForwardKinematics
@@ -32,7 +37,6 @@ class Benchmark:
     steps: int = 30
     repeats: int = 8
     num_threads: int = 1
-    """Threads of physics and rendering."""
 
 
 def report(name: str, unit: str, values: list[float]) -> None:
@@ -132,7 +136,8 @@ def rates(settings: Benchmark, rollouts: TensorDict, folder: Path) -> None:
 
 
 def main(settings: Benchmark) -> None:
-    torch.set_num_threads(1)
+    with refusals():
+        use_threads(settings.num_threads)
     print(f"median of {settings.repeats} [range]")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

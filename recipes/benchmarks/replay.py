@@ -6,6 +6,7 @@ actions, recorded from batches and replayed alone in fresh envs. With a finished
 
 from __future__ import annotations
 
+import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -14,6 +15,10 @@ from pathlib import Path
 import torch
 import tyro
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the recipes beside this folder
+
+from command_line import refusals
+from threads import use_threads
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import ExpertPolicy, ImaginedEnv, Reflect, TabletopEnv, chunked
@@ -35,6 +40,8 @@ class Benchmark:
     run: Path | None = None
     """A run folder with checkpoints and exploration: imagined rollouts are replayed, too."""
     imagined: int = 32
+    num_threads: int = 1
+    """Of what is recorded; its replays take as many."""
 
 
 def physics(settings: Benchmark, path: Path) -> int:
@@ -93,6 +100,8 @@ def count(file: Path, number: int, **options) -> None:
 
 
 def main(settings: Benchmark) -> None:
+    with refusals():
+        use_threads(settings.num_threads)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder)
         physics(settings, path)
@@ -104,5 +113,4 @@ def main(settings: Benchmark) -> None:
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
     main(tyro.cli(Benchmark, description=__doc__))

@@ -9,6 +9,7 @@ taken half a second; the warm-up is long enough for that. Memory is that of the 
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import statistics
 import sys
@@ -28,6 +29,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from command_line import at_least, refusals
 from task_names import SUITES, named_tasks
+from threads import use_threads
 from worldenv_trl.envs import ExpertPolicy, TabletopEnv
 from worldenv_trl.keys import ACTION, ACTION_DIM, NUM_STEPS
 from worldenv_trl.scenes import ScriptedExpert, Task, list_tasks, load_task
@@ -45,6 +47,8 @@ class Benchmark:
     image_sizes: tuple[int, ...] = (64, 128, 256)
     rows: tuple[int, ...] = (1, 16, 64)
     threads: tuple[int, ...] = (1, 2)
+    num_threads: int = 1
+    """Of torch, which does little here; those of the scenes are ``threads``."""
     actions: Literal["random", "expert"] = "random"
     """Uniform in [-1, 1], or what the scripted expert does (for tasks it has a script for)."""
     repeats: int = 3
@@ -140,11 +144,11 @@ def check(settings: Benchmark) -> None:
 def main(settings: Benchmark) -> None:
     with refusals():
         check(settings)
+        use_threads(settings.num_threads)
     sizes, rows = settings.image_sizes, settings.rows
     if settings.quick:
-        settings = Benchmark(settings.tasks, threads=settings.threads, actions=settings.actions, repeats=2, seconds=0.2)
+        settings = dataclasses.replace(settings, repeats=2, seconds=0.2)
         sizes, rows = (64, 128), (16,)
-    torch.set_num_threads(1)
     load = os.getloadavg()[0]
     print(f"{os.cpu_count()} cores, load before {load:.1f}, {settings.actions} actions, {settings.repeats} repeats")
     if load > 0.5:

@@ -22,6 +22,7 @@ from outcomes import physics_outcomes
 from run import Run
 from run_folder import RunFolder
 from sft import fine_tune
+from threads import use_threads
 from worldenv_trl.metrics import wilson_interval
 from worldenv_trl.policies import laplace_actor
 from worldenv_trl.scenes import list_tasks, load_task
@@ -57,6 +58,7 @@ def main(settings: Settings) -> None:
         check_config(config)
         folder = RunFolder(config.run_dir)
         folder.open(config)
+    use_threads(config.num_threads)
     run = Run(config, folder)
     demonstrate(run)
     fine_tune(run)

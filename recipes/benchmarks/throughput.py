@@ -21,12 +21,14 @@ import tyro
 from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
+from command_line import refusals
 from config import WorldEnvConfig
 from imagination import Imagination
 from parts import COMPACT
 from physics import physics_waves_env, tabletop
 from run import Run
 from run_folder import RunFolder
+from threads import use_threads
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.data import episodes_from_rollouts, policy_samples, window_buffer
@@ -82,7 +84,8 @@ def rate(work: Callable[[], float], repeats: int) -> list[float]:
 
 
 def main(settings: Benchmark) -> None:
-    torch.set_num_threads(settings.num_threads)
+    with refusals():
+        use_threads(settings.num_threads)
     torch.manual_seed(0)
     config = WorldEnvConfig(num_threads=settings.num_threads)
     print(f"{settings.num_threads} threads, median of {settings.repeats} [range]")

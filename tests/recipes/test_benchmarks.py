@@ -58,6 +58,17 @@ def test_what_cannot_be_measured_is_refused(name, settings, message, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    "name", ["damage", "expert", "group_signal", "kill", "record", "replay", "scenes", "sft", "throughput"]
+)
+def test_every_benchmark_takes_the_number_of_threads(name, tmp_path):
+    module = benchmark(name)
+    kind = module.Settings if hasattr(module, "Settings") else module.Benchmark
+    needed = {"sft": {"run_dir": tmp_path / "run"}, "group_signal": {"run": tmp_path}}.get(name, {})
+    with pytest.raises(SystemExit, match=r"num[_-]threads must be at least 1, got 0"):
+        module.main(kind(num_threads=0, **needed))
+
+
 @pytest.mark.skipif(not Path("/proc/self/smaps_rollup").exists(), reason="memory is read from Linux's /proc")
 def test_the_memory_of_a_stage_is_that_of_its_helpers_too(tmp_path):
     helper = "import time; x = bytearray(150_000_000); time.sleep(1.5)"

@@ -16,6 +16,7 @@ from report import Report, main
 from run import write_rules
 from run_folder import RunFolder
 from worldenv_trl.reflectors import StopRule
+from worldenv_trl.scenes.catalogue import SUITES_FOLDER
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +127,30 @@ def test_tasks_that_have_changed_since_are_named_with_the_remedy(finished, tmp_p
     said = capsys.readouterr().out
     assert f"warning: missing in the report: {message}" in said and "--no-models" in said
     assert "<video" not in page and task in page
+
+
+def test_a_task_file_that_is_not_found_from_here_is_named_with_the_folder_to_call_from(finished, tmp_path, monkeypatch):
+    run, away = tmp_path / "run", tmp_path / "away"
+    shutil.copytree(finished, run)
+    away.mkdir()
+    (tmp_path / "mine.bddl").write_text((SUITES_FOLDER / f"{GOAL_TASKS[1]}.bddl").read_text())
+    settings = yaml.safe_load((run / "config.yaml").read_text()) | {"tasks": ["mine.bddl"]}
+    (run / "config.yaml").write_text(yaml.safe_dump(settings))
+    monkeypatch.chdir(away)
+    page = report_of(run)
+    assert f"there is no task file {away / 'mine.bddl'}: the run was made with &#x27;mine.bddl&#x27;; call" in page
+    monkeypatch.chdir(tmp_path)
+    assert "<video" in report_of(run, clips_per_kind=1)
+
+
+def test_parts_of_the_users_own_are_said_to_be_passed(finished, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    path = run / "checkpoints" / "world_model" / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"class": "MyWorldModel"}))
+    assert "<video" not in report_of(run)
+    assert "holds a MyWorldModel, not a VideoWorldModel" in (said := capsys.readouterr().out)
+    assert "report.write(report.Report(folder), parts)" in said
 
 
 def test_the_versions_of_the_run_are_shown_beside_those_of_the_report(finished, tmp_path):

@@ -90,8 +90,8 @@ class TabletopEnv(EnvBase):
         proprio: ``commanded`` writes the controller's targets, ``measured`` the hand's pose and opening as they are.
         with_sim_state: write MuJoCo's integration state, padded with zeros to the longest of the tasks.
         seed: of the order of initial states; drawn from torch's generator when None.
-        num_threads: of physics, and processes that draw (this one, and helpers that start once they pay); two at most
-            by default.
+        num_threads: of physics, and processes that draw (this one, and helpers that start once they pay); torch's
+            number by default, two at most.
 
     Keys written: the images, ``("observation", "state")``, ``kinematic_state``, ``language_instruction``, ``task_id``,
     ``context_id`` (:func:`~worldenv_trl.context_ids.context_id`), ``num_steps``, ``success``, optionally
@@ -167,7 +167,7 @@ class TabletopEnv(EnvBase):
             for item, number in zip(tasks, numbers, strict=True)
         ]
         group = np.arange(num_envs) // group_repeats
-        threads = min(2 if num_threads is None else max(1, num_threads), num_envs)
+        threads = min(min(2, torch.get_num_threads()) if num_threads is None else num_threads, num_envs)
         self._executor = ThreadPoolExecutor(threads) if len(tasks) > 1 and threads > 1 else None
         self._pool = RendererPool(threads) if cameras else None
         self._blocks: list[_Block] = []

@@ -4,6 +4,7 @@ from worldenv_trl.report.evidence import Clip, Evidence, RunRecord, choose_clips
 from worldenv_trl.report.page import render_report, write_report
 from worldenv_trl.report.plots import plot_run
 from worldenv_trl.report.table import summary_table
+from worldenv_trl.report.video import video_webm
 
 __all__ = [
     "Clip",
@@ -15,5 +16,6 @@ __all__ = [
     "plot_run",
     "render_report",
     "summary_table",
+    "video_webm",
     "write_report",
 ]

@@ -8,7 +8,7 @@ import io
 import torch
 from torch import Tensor
 
-__all__ = ["image_uri", "side_by_side", "video_uri"]
+__all__ = ["image_uri", "side_by_side", "video_uri", "video_webm"]
 
 
 def side_by_side(*videos: Tensor, gap: int = 2) -> Tensor:
@@ -19,8 +19,8 @@ def side_by_side(*videos: Tensor, gap: int = 2) -> Tensor:
     return torch.cat(parts[1:], -1)
 
 
-def video_uri(frames: Tensor, *, fps: int = 10, scale: int = 1, quality: int = 30) -> str:
-    """A VP9 WebM of frames uint8 ``[T, 3, H, W]``.
+def video_webm(frames: Tensor, *, fps: int = 10, scale: int = 1, quality: int = 30) -> bytes:
+    """A VP9 WebM file of frames uint8 ``[T, 3, H, W]``.
 
     Keyword Args:
         fps: frames a second.
@@ -31,7 +31,7 @@ def video_uri(frames: Tensor, *, fps: int = 10, scale: int = 1, quality: int = 3
         ValueError: for frames of another shape or dtype, or none at all.
         ModuleNotFoundError: without PyAV.
     """
-    import av  # only reports need it
+    import av  # only reports and loggers need it
 
     if frames.ndim != 4 or frames.shape[1] != 3 or not len(frames) or frames.dtype != torch.uint8:
         raise ValueError(f"frames must be uint8 [T, 3, H, W], T >= 1, got {frames.dtype} {list(frames.shape)}")
@@ -51,7 +51,13 @@ def video_uri(frames: Tensor, *, fps: int = 10, scale: int = 1, quality: int = 3
                 container.mux(packet)
         for packet in stream.encode():
             container.mux(packet)
-    return f"data:video/webm;base64,{base64.b64encode(target.getvalue()).decode()}"
+    return target.getvalue()
+
+
+def video_uri(frames: Tensor, *, fps: int = 10, scale: int = 1, quality: int = 30) -> str:
+    """What :func:`video_webm` makes, as a data URI."""
+    data = video_webm(frames, fps=fps, scale=scale, quality=quality)
+    return f"data:video/webm;base64,{base64.b64encode(data).decode()}"
 
 
 def image_uri(image: Tensor) -> str:

@@ -1,0 +1,24 @@
+"""How many threads a command computes with: every recipe and benchmark asks here, and nothing else sets it."""
+
+from __future__ import annotations
+
+import os
+
+import torch
+
+VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+
+def use_threads(count: int) -> None:
+    """Lets torch compute with ``count`` threads, and OpenMP, MKL and OpenBLAS in processes that start from now on.
+
+    Physics and drawing follow: an env made without ``num_threads`` takes torch's number, two at most. What has started
+    its threads before, NumPy's OpenBLAS for one, keeps them. A replay computes with as many as its recording did.
+
+    Raises:
+        ValueError: if ``count`` is below 1.
+    """
+    if count < 1:
+        raise ValueError(f"--num-threads must be at least 1, got {count}")
+    torch.set_num_threads(count)
+    os.environ.update(dict.fromkeys(VARIABLES, str(count)))
