@@ -40,6 +40,10 @@ def benchmark(name: str):
         ("expert", {"tasks": ("nowhere.bddl",)}, "there is no task file nowhere.bddl"),
         ("expert", {"count": 0}, "--count must be at least 1, got 0"),
         ("expert", {"processes": 0}, "--processes must be at least 1, got 0"),
+        ("throughput", {"device": "gpu"}, "device must be auto, cpu, cuda or cuda:N, got 'gpu'"),
+        ("throughput", {"device": "cuda:99"}, "device 'cuda:99' does not exist"),
+        ("throughput", {"group_size": 1}, "--group-size must be at least 2, got 1"),
+        ("sft", {"device": "cuda:99"}, "device 'cuda:99' does not exist"),
         ("sft", {"suite": "gaol"}, "unknown suite 'gaol'"),
         ("sft", {"episodes_per_task": 0}, "--episodes-per-task must be at least 1, got 0"),
         ("sft", {"num_threads": 0}, "num_threads must be at least 1, got 0"),
@@ -50,7 +54,7 @@ def test_what_cannot_be_measured_is_refused(name, settings, message, tmp_path):
     module = benchmark(name)
     if name == "sft":
         settings = {"run_dir": tmp_path / "run"} | settings
-    kind = module.Benchmark if name == "scenes" else module.Settings
+    kind = module.Benchmark if hasattr(module, "Benchmark") else module.Settings
     with pytest.raises(SystemExit, match=f"^error: .*{message}"):
         module.main(kind(**settings))
     assert not (tmp_path / "run").exists()
