@@ -17,6 +17,7 @@ import tyro
 from command_line import in_options
 from gather_evidence import gather, short
 from parts import COMPACT, Parts
+from worldenv_trl.devices import choose_device
 from worldenv_trl.report import Evidence, RunRecord, write_report
 
 
@@ -33,6 +34,8 @@ class Report:
     clips_per_kind: int = 3
     """Film strips of each kind of episode."""
     num_threads: int = 1
+    device: str = "auto"
+    """Of the models: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one."""
     show: bool = False
     """Open the report in the browser."""
 
@@ -63,12 +66,13 @@ def write(settings: Report, parts: Parts = COMPACT) -> Path:
             "episodes-per-task must be at least 1 and clips-per-kind at least 0, "
             f"got {settings.episodes_per_task} and {settings.clips_per_kind}"
         )
+    choose_device(settings.device)
     torch.set_num_threads(settings.num_threads)
     evidence = None
     if settings.models:
         try:
             counts = settings.episodes_per_task, settings.clips_per_kind
-            evidence = gather(record, *counts, settings.num_threads, parts)
+            evidence = gather(record, *counts, settings.num_threads, parts, settings.device)
         except (OSError, ValueError, RuntimeError) as error:  # the logged figures are shown all the same
             evidence = Evidence(missing=[short(error)])
         for what in evidence.missing:

@@ -87,7 +87,7 @@ class RunFolder:
             old = yaml.safe_load(stored.read_text())
             # What has become a setting since then was at its default.
             before, now = _flat(_plain(dataclasses.asdict(type(config)()))) | _flat(old), _flat(new)
-            free = {"run_dir", "num_threads"}
+            free = {"run_dir", "num_threads", "device"}
             changed = [key for key in now if before.get(key) != now[key] and key not in free]
             if changed:
                 key, more = changed[0], f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
