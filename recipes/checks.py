@@ -6,12 +6,14 @@ from config import WorldEnvConfig
 from loggers import check_loggers
 from parts import COMPACT, Parts
 from physics import tabletop
+from worldenv_trl.devices import choose_device
 from worldenv_trl.reflectors import StopRule
 from worldenv_trl.scenes import load_task
 
 
 def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
-    """Fails before any long work starts if a task is unknown, a setting impossible or no GL backend renders.
+    """Fails before any long work starts if a task is unknown, a setting impossible, a device missing or no
+    GL backend renders.
 
     What only the compact parts refuse is found by making those of them that ``parts`` holds; others, which may take
     long to make, are not made.
@@ -20,6 +22,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         ValueError: naming the setting.
         RuntimeError: if nothing can be drawn.
     """
+    choose_device(config.device)
     if not config.tasks:
         raise ValueError("tasks is empty: name at least one task, for instance starter/open_the_top_drawer")
     if len(set(config.tasks)) < len(config.tasks):

@@ -154,6 +154,9 @@ class WorldEnvConfig:
     """Of every random choice; demonstrations and initial states stay the same."""
     num_threads: int = 2
     """CPU threads. Beside other jobs 1 is faster: threads that wait for a busy core make all wait."""
+    device: str = "auto"
+    """Of the models, imagination and every update: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one.
+    The physics and the recordings stay on the CPU."""
     checkpoint_minutes: float = 2.0
     """Between two checkpoints of the running stage: at most so much is lost when it is killed."""
     logger: tuple[str, ...] = ()

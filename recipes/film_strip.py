@@ -41,6 +41,8 @@ class Settings:
     """Which held-out initial state of each task."""
     columns: int = 7
     num_threads: int = 1
+    device: str = "auto"
+    """Of the models: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one."""
 
 
 def main(settings: Settings) -> None:
@@ -48,7 +50,7 @@ def main(settings: Settings) -> None:
         at_least(2, columns=settings.columns)
         at_least(0, state=settings.state)
         use_threads(settings.num_threads)
-        config = read_config(RunRecord.read(settings.run), settings.num_threads)
+        config = read_config(RunRecord.read(settings.run), settings.num_threads, settings.device)
         run = Run(config, RunFolder(settings.run))
         models = run.world_model(), run.reflector(), run.rules()
         actor = laplace_actor(run.policy(settings.policy).eval())

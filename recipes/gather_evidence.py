@@ -19,6 +19,7 @@ from two_worlds import TwoWorlds, honesty_of, imagine, live, relive
 from worldenv_trl import keys
 from worldenv_trl.data import Episodes, episodes_from_rollouts
 from worldenv_trl.data.episodes import concatenated
+from worldenv_trl.devices import choose_device
 from worldenv_trl.metrics import advantage_correlation, first_success, honesty, judged, moving_pixel_psnr
 from worldenv_trl.policies import laplace_actor
 from worldenv_trl.record import read_rollouts
@@ -32,15 +33,21 @@ _AT_ONCE = 16  # rollouts in memory while a wave is read
 
 
 def gather(
-    record: RunRecord, episodes_per_task: int, clips_per_kind: int, num_threads: int, parts: Parts = COMPACT
+    record: RunRecord,
+    episodes_per_task: int,
+    clips_per_kind: int,
+    num_threads: int,
+    parts: Parts = COMPACT,
+    device: str = "auto",
 ) -> Evidence:
     """Everything that needs the run's models; what cannot be had is named in ``missing``.
 
     Raises:
         FileNotFoundError: for a checkpoint that is missing, naming the stage that makes it.
-        ValueError: for tasks that this release does not have, or whose instructions the models were not trained on.
+        ValueError: for tasks that this release does not have, or whose instructions the models were not trained on; for
+            a device that does not exist.
     """
-    config = read_config(record, num_threads)
+    config = read_config(record, num_threads, device)
     run = Run(config, RunFolder(record.path), parts)
     models = [path.name for path in sorted((record.path / "checkpoints").glob("reflector*")) if path.is_dir()]
     suffix = models[-1].removeprefix("reflector") if models else ""
@@ -97,14 +104,16 @@ def _remedy(record: RunRecord) -> str:
     return f"Write the report with the release that made the run{f' ({made})' if made else ''}, or pass --no-models"
 
 
-def read_config(record: RunRecord, num_threads: int) -> WorldEnvConfig:
-    """The run's settings; one that this release does not know is left out.
+def read_config(record: RunRecord, num_threads: int, device: str = "auto") -> WorldEnvConfig:
+    """The run's settings but for what this machine decides; one that this release does not know is left out.
 
     Raises:
         FileNotFoundError: naming a task file that is not found from here.
-        ValueError: naming a task that this release does not have.
+        ValueError: naming a task that this release does not have, or a device that does not exist.
     """
-    config = dataclasses.replace(_filled(WorldEnvConfig(), record.config), run_dir=record.path, num_threads=num_threads)
+    choose_device(device)
+    here = {"run_dir": record.path, "num_threads": num_threads, "device": device}
+    config = dataclasses.replace(_filled(WorldEnvConfig(), record.config), **here)
     for task in config.tasks:
         try:
             load_task(task)

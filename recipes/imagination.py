@@ -14,6 +14,7 @@ from episodes import demonstrations_and_exploration
 from parts import PROPRIO
 from run import Run
 from worldenv_trl import keys
+from worldenv_trl.devices import to_device
 from worldenv_trl.envs import ContextSampler, FramesAside, ImaginedEnv, Reflect
 from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.row_texts import row_texts
@@ -34,7 +35,8 @@ class Imagination:
         """That of a round."""
         world_model = run.world_model(suffix)
         contexts = read_contexts(run, world_model.cameras, rounds=int(suffix.removeprefix("_") or 1))
-        return cls(world_model, run.reflector(suffix), run.rules(suffix)["imagined"], contexts)
+        rule = run.rules(suffix)["imagined"]
+        return cls(world_model, run.reflector(suffix), rule, to_device(contexts, run.device))
 
     def env(
         self,

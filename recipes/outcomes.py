@@ -19,6 +19,7 @@ from run import Run
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import Reflect, chunked, context_id
+from worldenv_trl.policies import DeviceBridge
 from worldenv_trl.record import RolloutWriter
 from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.scenes import load_task
@@ -62,7 +63,7 @@ def physics_outcomes(
     waves = -(-episodes // num_envs)
     collector = GroupCollector(
         env,
-        actor,
+        DeviceBridge(actor),
         groups_per_batch=num_envs,
         group_size=1,
         total_groups=waves * num_envs,

@@ -13,7 +13,7 @@ from config import WorldEnvConfig
 from parts import PROPRIO
 from seeds import stage_seed
 from worldenv_trl.envs import ContextSampler, TabletopEnv, chunked
-from worldenv_trl.policies import LaplaceActor, Policy, laplace_actor, scale_bounds
+from worldenv_trl.policies import DeviceBridge, LaplaceActor, Policy, laplace_actor, scale_bounds
 from worldenv_trl.record import provenance
 
 
@@ -61,7 +61,7 @@ def physics_waves_env(
 
 def chunk_player(actor: LaplaceActor, chunk_length: int) -> MultiStepActorWrapper:
     """Plays the actor's chunks open loop, one action a step. Its log-probs are stale: never train on them."""
-    return MultiStepActorWrapper(actor, n_steps=chunk_length)
+    return MultiStepActorWrapper(DeviceBridge(actor), n_steps=chunk_length)
 
 
 def exploring_actor(config: WorldEnvConfig, policy: Policy, scale_factor: float) -> LaplaceActor:

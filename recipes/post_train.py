@@ -20,13 +20,13 @@ from probes import probe, probed_iterations, warning
 from resumable import Resumable
 from run import Run
 from stages import run_alone
-from updates import PATIENCE, STUCK, rate_factor, stuck, update
+from updates import PATIENCE, STUCK, rate_factor, ratios, stuck, update
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import ContextSampler, FramesAside
 from worldenv_trl.metrics import HonestyAlarm
 from worldenv_trl.objectives import LOOPLoss, rloo_advantage
-from worldenv_trl.policies import Policy, laplace_actor
+from worldenv_trl.policies import DeviceBridge, Policy, laplace_actor
 from worldenv_trl.record import RolloutWriter
 
 
@@ -68,7 +68,7 @@ def post_train(
         env = physics_waves_env(config, *shape, seed=run.seed(target, "env"), sampler=sampler)
     collector = GroupCollector(
         env,
-        actor,
+        actor if imagination else DeviceBridge(actor),
         groups_per_batch=settings.groups,
         total_groups=settings.iterations * settings.groups,
         group_size=settings.group_size,
@@ -116,8 +116,7 @@ def post_train(
         if counts["stuck"] == PATIENCE:
             progress.write(STUCK.format(target, iteration, PATIENCE, settings.max_kl))
         if about:
-            parts = wave.reshape(-1).split(64)
-            wave.update(torch.cat([loss.ratios(part) for part in parts]).reshape(wave.shape))
+            wave.update(ratios(wave, policy.in_keys, loss))
             _write(run, f"{target}_{iteration:03d}", about, wave, aside)
         mean.update_parameters(policy)
         collector.update_policy_weights_()

@@ -22,6 +22,7 @@ import tyro
 
 from command_line import one_line_errors
 from parts import COMPACT, Kind, Part, Parts
+from worldenv_trl.devices import choose_device
 from worldenv_trl.policies import LaplaceActor, Policy, laplace_actor, scale_bounds
 from worldenv_trl.record import model_hash, parse_edit, read_metadata, replay
 from worldenv_trl.record.replay.source import open_rollout
@@ -53,6 +54,9 @@ class Options:
     """What-if: actions to change, such as "43 gripper=-1" or "40-47 dz=0.5"; may be given several times."""
     target: Path | None = None
     """The new file; beside the old one if not given."""
+    device: str | None = None
+    """Of the models: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one. As recorded, if possible,
+    when not given: another one rounds otherwise and draws other noise."""
     json: Path | None = None
     """Write the report there, too ("-" prints it instead of the words)."""
     overwrite: bool = False
@@ -66,28 +70,31 @@ def main(options: Options, parts: Parts = COMPACT) -> int:
     if options.threshold is not None and not 0 < options.threshold < 1:
         raise ValueError(f"--threshold must be in (0, 1), got {options.threshold}")
     metadata = read_metadata(options.file)
+    device = choose_device(options.device or ("auto" if metadata.get("device", "cpu") != "cpu" else "cpu"))
     imagined = options.mode == "imagination" or (
         options.mode is None and open_rollout(options.file, options.rollout).imagined
     )
     reflector = options.reflector or ("recorded" if options.threshold is not None else None)
     policy = None
     if options.policy is not None:
-        acting = _checkpoint(parts.policy, options.policy, options.file, metadata, "policy")
+        acting = _checkpoint(parts.policy, options.policy, options.file, metadata, "policy").to(device)
         policy = recorded_actor(acting, metadata.get("config", {}))
     edits: dict[int, dict[int, float]] = {}
     for text in options.edit:
         for step, values in parse_edit(text).items():
             edits.setdefault(step, {}).update(values)
+    world_model = None
+    if imagined:
+        found = _checkpoint(parts.world_model, options.world_model, options.file, metadata, "world_model")
+        world_model = found.to(device)
     report = replay(
         options.file,
         options.rollout,
         mode=options.mode,
-        world_model=_checkpoint(parts.world_model, options.world_model, options.file, metadata, "world_model")
-        if imagined
-        else None,
+        world_model=world_model,
         reflector=None
         if reflector is None
-        else _checkpoint(parts.reflector, reflector, options.file, metadata, "reflector"),
+        else _checkpoint(parts.reflector, reflector, options.file, metadata, "reflector").to(device),
         from_step=options.from_step,
         policy=policy,
         seed=options.seed,

@@ -17,6 +17,7 @@ from command_line import refusals
 from gather_evidence import gather, short
 from parts import COMPACT, Parts
 from threads import use_threads
+from worldenv_trl.devices import choose_device
 from worldenv_trl.pretrained import OtherClassError
 from worldenv_trl.report import Evidence, RunRecord, write_report
 
@@ -34,6 +35,8 @@ class Report:
     clips_per_kind: int = 3
     """Film strips of each kind of episode."""
     num_threads: int = 1
+    device: str = "auto"
+    """Of the models: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one."""
     show: bool = False
     """Open the report in the browser."""
 
@@ -62,12 +65,13 @@ def write(settings: Report, parts: Parts = COMPACT) -> Path:
             "episodes-per-task must be at least 1 and clips-per-kind at least 0, "
             f"got {settings.episodes_per_task} and {settings.clips_per_kind}"
         )
+    choose_device(settings.device)
     use_threads(settings.num_threads)
     evidence = None
     if settings.models:
         try:
             counts = settings.episodes_per_task, settings.clips_per_kind
-            evidence = gather(record, *counts, settings.num_threads, parts)
+            evidence = gather(record, *counts, settings.num_threads, parts, settings.device)
         except OtherClassError as error:
             own = "parts of your own are passed as recipes/README.md says: report.write(report.Report(folder), parts)"
             evidence = Evidence(missing=[f"{short(error)}; {own}"])

@@ -13,6 +13,7 @@ from config import WorldEnvConfig
 from parts import COMPACT, Parts
 from run_folder import RunFolder
 from seeds import stage_seed
+from worldenv_trl.devices import choose_device
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.policies import Policy
 from worldenv_trl.reflectors import Reflector, StopRule
@@ -30,8 +31,17 @@ class Run:
     parts: Parts = COMPACT
 
     @cached_property
+    def device(self) -> torch.device:
+        """Where the parts compute; the physics, and all that is read and written, are on the CPU.
+
+        Raises:
+            ValueError: for one that does not exist.
+        """
+        return choose_device(self.config.device)
+
+    @cached_property
     def kinematics(self) -> ForwardKinematics:
-        return self.parts.kinematics()
+        return self.parts.kinematics().to(self.device)
 
     def seed(self, stage: str, use: str = "") -> int:
         """Of one use of random numbers in a stage; see :func:`seeds.stage_seed`."""
@@ -43,15 +53,15 @@ class Run:
 
     def policy(self, name: str) -> Policy:
         stage = "sft" if name == "sft" else "post_train"
-        return self.parts.policy.load(self.folder.require_checkpoint(name, stage))
+        return self.parts.policy.load(self.folder.require_checkpoint(name, stage)).to(self.device)
 
     def world_model(self, suffix: str = "") -> WorldModel:
         path = self.folder.require_checkpoint(f"world_model{suffix}", "train_world_model")
-        return self.parts.world_model.load(path).eval()
+        return self.parts.world_model.load(path).eval().to(self.device)
 
     def reflector(self, suffix: str = "") -> Reflector:
         path = self.folder.require_checkpoint(f"reflector{suffix}", "train_reflector")
-        return self.parts.reflector.load(path).eval().requires_grad_(False)
+        return self.parts.reflector.load(path).eval().requires_grad_(False).to(self.device)
 
     def rules(self, suffix: str = "") -> dict[str, StopRule]:
         """When the reflector stops ``imagined`` and ``real`` rollouts."""

@@ -28,7 +28,7 @@ from loggers import Loggers
 from worldenv_trl.report import machine_versions
 
 MIN_FREE_GB = 1.0
-FREE = {"run_dir", "num_threads", "checkpoint_minutes", "logger"}
+FREE = {"run_dir", "num_threads", "device", "checkpoint_minutes", "logger"}
 """Settings that do not change what a run computes: it may be continued with others."""
 
 

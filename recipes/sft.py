@@ -20,6 +20,7 @@ from run import Run
 from stages import run_alone
 from worldenv_trl import keys
 from worldenv_trl.data import policy_samples
+from worldenv_trl.devices import to_device
 from worldenv_trl.policies import Policy, laplace_actor, likelihood_actor, random_shift
 
 
@@ -28,7 +29,7 @@ def fine_tune(run: Run) -> None:
     config, settings = run.config, run.config.sft
     run.seed_everything("sft")
     samples = policy_samples(demonstrations(run), config.chunk_length)
-    policy = run.parts.policy.make(config)
+    policy = run.parts.policy.make(config).to(run.device)
     policy.fit_statistics(samples[keys.STATE], samples[keys.CHUNK])
     scale = list(policy.scale_parameters())
     learning = [parameter for parameter in policy.parameters() if parameter.requires_grad]
@@ -71,7 +72,7 @@ def _train(
     )
     progress = Resumable(run, name, steps, policy=policy, optimizer=optimizer, schedule=schedule).bar(f"sft {name}")
     for step in progress:
-        batch = samples[torch.randint(len(samples), (settings.batch_size,))]
+        batch = to_device(samples[torch.randint(len(samples), (settings.batch_size,))], run.device)
         for image in images:
             batch[image] = random_shift(batch[image], settings.shift_px)
         value = loss(batch)["loss_bc"]

@@ -43,7 +43,7 @@ def train_reflector(run: Run, target: str = "reflector", models: str = "", round
         if len(chosen):
             episodes.append(imagine(training[chosen], "training"))
         imagined_held_out = imagine(held_out, "held out")
-        reflector = run.parts.reflector.make(config)
+        reflector = run.parts.reflector.make(config).to(run.device)
         learn(run, reflector, Episodes.cat([part.through(world_model.cameras) for part in episodes]), target)
         reflector.eval()
         scores = {

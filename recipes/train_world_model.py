@@ -32,7 +32,7 @@ def train_world_model(run: Run, target: str = "world_model", previous: str | Non
     training, held_out = split_by_context(explored, settings.holdout, run.seed("held-out contexts"))
     training = Episodes.cat([demonstrated, training])
     if previous is None:
-        model, steps = run.parts.world_model.make(config), settings.steps
+        model, steps = run.parts.world_model.make(config).to(run.device), settings.steps
     else:
         model, steps = run.world_model(previous.removeprefix("world_model")), settings.refit_steps
     parameters = [parameter for parameter in model.train().parameters() if parameter.requires_grad]

@@ -10,12 +10,14 @@ from tensordict import NestedKey, TensorDictBase
 
 from config import PostTrain
 from worldenv_trl import keys
+from worldenv_trl.devices import device_of, to_device
 from worldenv_trl.language import instructions_of
 from worldenv_trl.objectives import LOOPLoss
 from worldenv_trl.row_texts import row_texts
 
 PATIENCE = 3  # iterations
 _PIXELS = 256 * 3 * 64 * 64  # whose activations fit into memory together
+_PIXELS_ON_GPU = 16 * _PIXELS
 STUCK = (
     "warning: {}, iteration {}: for {} iterations the first update alone has moved the policy by more than max_kl={}, "
     "so nearly nothing is learned: the scale of a dimension may be too small for how far its mean moves "
@@ -40,7 +42,7 @@ def update(
     """K epochs of clipped updates on the decisions of a wave, stopped when the policy has moved too far.
 
     Args:
-        wave: [G, N, T] with advantages.
+        wave: [G, N, T] with advantages, on whatever device; what is learned from goes to the loss's, once.
         in_keys: what the policy reads.
 
     Decisions without an advantage teach nothing and are left out, but count among Eq. 5's steps. If there is no other
@@ -53,9 +55,10 @@ def update(
     learned = (keys.CHUNK, keys.LOG_PROBS, keys.ADVANTAGE, ("next", keys.STEP_MASK), keys.MASK)
     # Flat first: a mask that leaves a whole block of texts without one makes tensordict stumble over the empty stack.
     decisions = wave.select(*in_keys, *learned).reshape(-1)[informative.flatten()]
+    decisions = to_device(decisions, device_of(loss))
     decisions[keys.STEP_MASK] = decisions["next", keys.STEP_MASK]
     decisions.set(keys.INSTRUCTION, row_texts(instructions_of(decisions)))  # cheap to index, minibatch by minibatch
-    total_steps = (wave["next", keys.STEP_MASK] & mask.unsqueeze(-1)).sum()
+    total_steps = (wave["next", keys.STEP_MASK] & mask.unsqueeze(-1)).sum().to(decisions[keys.CHUNK].device)
     sums: dict[str, float] = {}
     count, stopped = 0, False
     for _ in range(settings.epochs):
@@ -80,19 +83,27 @@ def update(
 
 
 def _backward(loss: LOOPLoss, batch: TensorDictBase) -> dict[str, float]:
-    """Gradients and figures of a minibatch, as many rows at a time as 64 px images of one camera would be: the losses
-    of the parts add up to that of the whole."""
+    """Gradients and figures of a minibatch, so many rows at a time as fit: the losses of the parts add up to that of
+    the whole."""
     pixels = sum(value[0].numel() for value in batch["observation"].values() if value.dtype == torch.uint8)
+    at_once = _PIXELS if batch[keys.CHUNK].device.type == "cpu" else _PIXELS_ON_GPU
     steps, figures = batch[keys.STEP_MASK].sum(), dict[str, float]()
-    for part in batch.split(max(16, _PIXELS // max(pixels, 1))):
+    for part in batch.split(max(16, at_once // max(pixels, 1))):
         out = loss(part)
         out["loss_objective"].backward()
-        share = (part[keys.STEP_MASK].sum() / steps).item()
-        for name, value in out.items():
-            if value.numel() == 1:
-                weight = 1.0 if name == "loss_objective" else share
-                figures[name] = figures.get(name, 0.0) + weight * value.item()
+        names = [name for name, value in out.items() if value.numel() == 1]
+        share, *values = torch.stack([part[keys.STEP_MASK].sum() / steps, *(out[name] for name in names)]).tolist()
+        for name, value in zip(names, values, strict=True):
+            weight = 1.0 if name == "loss_objective" else share
+            figures[name] = figures.get(name, 0.0) + weight * value
     return figures
+
+
+def ratios(wave: TensorDictBase, in_keys: Sequence[NestedKey], loss: LOOPLoss) -> TensorDictBase:
+    """:meth:`LOOPLoss.ratios` of a wave [G, N, T], some decisions at a time; on the wave's device."""
+    names = {*in_keys, *loss.in_keys, ("next", keys.STEP_MASK), keys.MASK}
+    parts = (to_device(part, device_of(loss)) for part in wave.select(*names, strict=False).reshape(-1).split(64))
+    return to_device(torch.cat([loss.ratios(part) for part in parts]), wave[keys.CHUNK].device).reshape(wave.shape)
 
 
 def stuck(before: int, metrics: dict[str, float]) -> int:

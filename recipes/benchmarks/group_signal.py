@@ -97,6 +97,9 @@ class Settings:
     """JSON of all figures; WORLD_MODEL-REFLECTOR.json beside the groups if not given, with the beginning of their
     hashes where they are not the run's."""
     num_threads: int = 1
+    device: str = "auto"
+    """Of the models: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one. The predictor that sees no
+    video stays on the CPU."""
 
 
 def main(settings: Settings) -> Path:
@@ -104,7 +107,7 @@ def main(settings: Settings) -> Path:
         at_least(1, resamples=settings.resamples)
         at_least(2, shown_chunks=settings.shown_chunks or (2,))
         use_threads(settings.num_threads)
-        config = read_config(RunRecord.read(settings.run), settings.num_threads)
+        config = read_config(RunRecord.read(settings.run), settings.num_threads, settings.device)
         run = Run(config, RunFolder(settings.run))
         factor = config.post_train.scale_factor if settings.scale_factor is None else settings.scale_factor
         draw = Draw(settings.contexts, settings.group_size, factor, settings.seed)
@@ -114,9 +117,10 @@ def main(settings: Settings) -> Path:
             "world_model": checkpoint(run, settings.world_model, "train_world_model"),
             "reflector": checkpoint(run, settings.reflector, "train_reflector"),
         }
-        policy = run.parts.policy.load(paths["policy"])
-        world_model = run.parts.world_model.load(paths["world_model"]).eval()
-        judge = RuledReflector(run.parts.reflector.load(paths["reflector"]).eval(), read_rules(paths["reflector"]))
+        policy = run.parts.policy.load(paths["policy"]).to(run.device)
+        world_model = run.parts.world_model.load(paths["world_model"]).eval().to(run.device)
+        reflector = run.parts.reflector.load(paths["reflector"]).eval().to(run.device)
+        judge = RuledReflector(reflector, read_rules(paths["reflector"]))
         explored = demonstrations_and_exploration(run, 1)[1] if settings.direct else None
         before = None if settings.against is None else read_report(settings.against)
         folder = settings.groups or settings.run / "signal" / paths["policy"].name

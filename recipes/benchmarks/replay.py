@@ -21,6 +21,7 @@ from command_line import refusals
 from threads import use_threads
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
+from worldenv_trl.devices import choose_device
 from worldenv_trl.envs import ExpertPolicy, ImaginedEnv, Reflect, TabletopEnv, chunked
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.policies import OFTPolicy, laplace_actor
@@ -42,6 +43,8 @@ class Benchmark:
     imagined: int = 32
     num_threads: int = 1
     """Of what is recorded; its replays take as many."""
+    device: str = "cpu"
+    """Of the models."""
 
 
 def physics(settings: Benchmark, path: Path) -> int:
@@ -71,13 +74,19 @@ def physics(settings: Benchmark, path: Path) -> int:
 
 
 def imagined(settings: Benchmark, path: Path) -> VideoWorldModel:
-    load = settings.run / "checkpoints"
-    model = VideoWorldModel.from_pretrained(load / "world_model").eval()
-    reflector = CompactReflector.from_pretrained(load / "reflector").eval()
-    policy = OFTPolicy.from_pretrained(load / "sft").eval()
+    load, device = settings.run / "checkpoints", choose_device(settings.device)
+    model = VideoWorldModel.from_pretrained(load / "world_model", device=device).eval()
+    reflector = CompactReflector.from_pretrained(load / "reflector", device=device).eval()
+    policy = OFTPolicy.from_pretrained(load / "sft", device=device).eval()
     contexts = read_rollouts(settings.run / "rollouts" / "explore.mcap", rollouts=range(8))[:, 0]
     env = ImaginedEnv(
-        model, ForwardKinematics(), contexts, [settings.imagined // 8, 8], max_steps=settings.max_steps, seed=0
+        model,
+        ForwardKinematics().to(device),
+        contexts,
+        [settings.imagined // 8, 8],
+        max_steps=settings.max_steps,
+        seed=0,
+        device=device,
     ).append_transform(Reflect(reflector))
     collector = GroupCollector(env, laplace_actor(policy), groups_per_batch=settings.imagined // 8)
     with RolloutWriter(path / "imagined.mcap", **provenance(env, models={"world_model": model})) as writer:

@@ -38,6 +38,8 @@ class Settings:
     """Held-out initial states of each task, the first ones."""
     seed: int = 0
     num_threads: int = 2
+    device: str = "auto"
+    """Of the policy: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one."""
     sft: SFT = field(default_factory=lambda: SFT(steps=3000))
 
 
@@ -50,6 +52,7 @@ def main(settings: Settings) -> None:
         run_dir=settings.run_dir,
         seed=settings.seed,
         num_threads=settings.num_threads,
+        device=settings.device,
         tasks=tasks,
         max_steps=steps,
         sft=settings.sft,

@@ -211,8 +211,8 @@ def test_a_request_without_a_goal_is_refused(model):
 @pytest.mark.parametrize(("size", "cameras", "rows"), [(64, 1, 16), (64, 2, 16), (128, 1, 8), (128, 2, 4), (512, 2, 1)])
 def test_fewer_rows_of_larger_images_pass_at_once(size, cameras, rows):
     some = {str(index): {"open the drawer": {}} for index in range(cameras)}
-    assert VideoWorldModelConfig(cameras=some, image_size=size, patch=size // 16).rows_at_once == rows
-    assert VideoWorldModelConfig(cameras=some, image_size=size, rows_per_call=5).rows_at_once == 5
+    assert VideoWorldModelConfig(cameras=some, image_size=size, patch=size // 16).rows_at_once() == rows
+    assert VideoWorldModelConfig(cameras=some, image_size=size, rows_per_call=5).rows_at_once() == 5
 
 
 def test_no_rows_at_once_are_refused():

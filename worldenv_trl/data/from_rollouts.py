@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from worldenv_trl.data.episodes import Episodes
+from worldenv_trl.devices import to_device
 from worldenv_trl.keys import (
     ACTION,
     CHUNK,
@@ -43,12 +44,14 @@ def episodes_from_rollouts(rollouts: TensorDictBase) -> Episodes:
     ``("collector", "mask")`` are left out; without a mask, those after the first ``done``.
 
     Decision-level rollouts know success at the last step of each decision; the steps before keep the previous value.
+    Episodes are on the CPU, wherever the rollouts are.
 
     Raises:
         ValueError: naming the entries that are missing, or rollouts in which nothing was executed.
     """
     if rollouts.ndim < 1 or 0 in rollouts.shape:
         raise ValueError(f"rollouts must be [*B, T] with at least one step, got {list(rollouts.shape)}")
+    rollouts = to_device(rollouts, torch.device("cpu"))
     rollouts = rollouts.reshape(-1, rollouts.shape[-1]) if rollouts.ndim != 2 else rollouts
     present = set(rollouts.keys(True, True))
     decisions = CHUNK in present and ACTION not in present

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from worldenv_trl.data.episodes import Episodes
 from worldenv_trl.data.store import FrameSink
+from worldenv_trl.devices import device_of, to_device
 from worldenv_trl.keys import frames_key
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.world_models import WorldModel, request
@@ -42,8 +43,8 @@ def imagine_episodes(
 
     Args:
         world_model: paints chunks of ``C`` frames.
-        episodes: their frames show the model's cameras.
-        kinematics: FK(s, a).
+        episodes: their frames show the model's cameras; on the CPU, as what is made of them.
+        kinematics: FK(s, a); where it is, on the device of the model, is imagined.
 
     Keyword Args:
         shown_chunks: see above, at least 1 (the first chunk has nothing but the recorded frame); None is all.
@@ -94,43 +95,46 @@ def _imagine(
 ) -> tuple[TensorDict, Tensor]:
     """Video [R, T + 1] and kinematic states [R, T + 1, 20] of the episodes with these ``numbers`` [R]."""
     rows, steps = episodes["actions"].shape[:2]
-    length = world_model.chunk_length
+    length, device = world_model.chunk_length, device_of(kinematics)
     spare = -steps % length  # the last chunk may reach past the end
-    actions = pad(episodes["actions"], (0, 0, 0, spare))
-    first = episodes["kinematic_states"][:, 0]
+    actions = pad(episodes["actions"], (0, 0, 0, spare)).to(device)
+    first = episodes["kinematic_states"][:, 0].to(device)
     states = torch.cat([first.unsqueeze(1), kinematics.rollout(first, actions)], 1)
-    row = torch.arange(rows).unsqueeze(-1)
+    row = torch.arange(rows).unsqueeze(-1)  # of episodes, which are on the CPU; an index may be there, too
     video = TensorDict({"poses": kinematics.pose(states)}, batch_size=[rows, steps + spare + 1])
     for camera in world_model.cameras:
-        real = episodes.frames(camera, row[:, 0], torch.zeros(rows, dtype=torch.int64))
+        real = episodes.frames(camera, row[:, 0], torch.zeros(rows, dtype=torch.int64)).to(device)
         video[frames_key(camera)] = real.new_zeros(*video.batch_size, *real.shape[1:])
         video[frames_key(camera)][:, 0] = real
     real_until = min(shown - 1, steps // length) * length  # the last frame of which a real one is remembered
     truth = video.clone() if real_until else video
     for camera in world_model.cameras if real_until else ():
-        truth[frames_key(camera)][:, : real_until + 1] = episodes.frames(camera, row, torch.arange(real_until + 1))
+        truth[frames_key(camera)][:, : real_until + 1] = episodes.frames(camera, row, torch.arange(real_until + 1)).to(
+            device
+        )
     for start in range(0, steps, length):
         chunk = torch.arange(start + 1, start + length + 1)
         if painted is not None and start < shown * length:
             for camera in world_model.cameras:
-                video[frames_key(camera)][:, chunk] = painted.frames(camera, row, chunk)
+                video[frames_key(camera)][:, chunk] = painted.frames(camera, row, chunk).to(device)
             continue
         memory = truth if start <= real_until else video
         asked = request(
             world_model,
             partial(_recall, memory, row),
-            torch.full((rows,), start),
+            torch.full((rows,), start, device=device),
             video["poses"][:, chunk],
             actions[:, chunk - 1],
             episodes.instructions,
-            noise_seed=noise_seeds(seed, numbers, torch.full_like(numbers, start)).unsqueeze(-1),
+            noise_seed=noise_seeds(seed, numbers, torch.full_like(numbers, start)).unsqueeze(-1).to(device),
         )
         frames = world_model(asked)
         for camera in world_model.cameras:
             video[frames_key(camera)][:, chunk] = frames[frames_key(camera)]
-    return video.exclude("poses")[:, : steps + 1], states[:, : steps + 1]
+    seen = to_device(video.exclude("poses")[:, : steps + 1], torch.device("cpu"))
+    return seen, states[:, : steps + 1].cpu()
 
 
 def _recall(video: TensorDict, row: Tensor, numbers: Tensor) -> TensorDict:
     """Frames and poses [R, K] by their numbers [R, K]."""
-    return video[row, numbers]
+    return video[row.to(numbers.device), numbers]

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from worldenv_trl.data.episodes import Episodes
+from worldenv_trl.devices import device_of
 from worldenv_trl.reflectors import Reflector
 
 __all__ = ["score_episodes"]
@@ -15,6 +16,8 @@ __all__ = ["score_episodes"]
 def score_episodes(reflector: Reflector, episodes: Episodes, *, rows_at_once: int = 16) -> Tensor:
     """R(o_1:t, g) of every frame, [R, T + 1]; past the end of an episode its last frame goes on.
 
+    Frames go to the reflector's device some rows at a time; scores come back.
+
     Keyword Args:
         rows_at_once: episodes whose frames are in memory at a time.
 
@@ -23,13 +26,17 @@ def score_episodes(reflector: Reflector, episodes: Episodes, *, rows_at_once: in
     """
     episodes.require("the reflector", reflector.cameras, reflector.image_size)
     steps = torch.arange(1, episodes["actions"].shape[1] + 1)
-    parts = []
+    device, parts = device_of(reflector), []
+
+    def shown(rows: Tensor, steps: Tensor) -> dict[str, Tensor]:
+        return {camera: episodes.frames(camera, rows, steps).to(device) for camera in reflector.cameras}
+
     for start in range(0, len(episodes), rows_at_once):
         rows = torch.arange(start, min(start + rows_at_once, len(episodes)))
-        first = {camera: episodes.frames(camera, rows, torch.zeros_like(rows)) for camera in reflector.cameras}
-        state = reflector.begin(first, [episodes.instructions[row] for row in rows.tolist()])
-        later = {camera: episodes.frames(camera, rows.unsqueeze(-1), steps) for camera in reflector.cameras}
+        state = reflector.begin(
+            shown(rows, torch.zeros_like(rows)), [episodes.instructions[row] for row in rows.tolist()]
+        )
         start_score = state["score"].clone()
-        _, scores = reflector.extend(state, later)
-        parts.append(torch.cat([start_score.unsqueeze(-1), scores], 1))
+        _, scores = reflector.extend(state, shown(rows.unsqueeze(-1), steps))
+        parts.append(torch.cat([start_score.unsqueeze(-1), scores], 1).cpu())
     return torch.cat(parts)

@@ -12,6 +12,7 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 
 from worldenv_trl.data.episodes import Episodes
+from worldenv_trl.devices import device_of, to_device
 from worldenv_trl.keys import FRAMES, INSTRUCTION, TASK_ID
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.row_texts import row_texts
@@ -25,11 +26,13 @@ def predicted_poses(episodes: Episodes, kinematics: ForwardKinematics) -> Tensor
     """Poses [R, T + 1, 13] of the hand, predicted open loop from each episode's first kinematic state and its actions.
 
     These, not the measured ones, condition the world model: in imagination there is nothing to measure (World-Env
-    section 3.2). Past the end of an episode the hand holds still.
+    section 3.2). Past the end of an episode the hand holds still. Predicted on the device of ``kinematics``, given on
+    the CPU.
     """
-    first = episodes["kinematic_states"][:, 0]
-    after = kinematics.rollout(first, episodes["actions"])
-    return kinematics.pose(torch.cat([first.unsqueeze(1), after], 1))
+    device = device_of(kinematics)
+    first = episodes["kinematic_states"][:, 0].to(device)
+    after = kinematics.rollout(first, episodes["actions"].to(device))
+    return kinematics.pose(torch.cat([first.unsqueeze(1), after], 1)).cpu()
 
 
 class WindowSampler(Sampler):
@@ -141,7 +144,9 @@ class WindowSampler(Sampler):
 class WindowBuffer(ReplayBuffer):
     """A ReplayBuffer whose samples are training windows; see :func:`window_buffer`."""
 
-    def __init__(self, episodes: Episodes, poses: Tensor, sampler: WindowSampler, batch_size: int) -> None:
+    def __init__(
+        self, episodes: Episodes, poses: Tensor, sampler: WindowSampler, batch_size: int, device: torch.device
+    ) -> None:
         frames, _ = episodes.video
         super().__init__(
             storage=TensorStorage(frames),
@@ -149,12 +154,12 @@ class WindowBuffer(ReplayBuffer):
             writer=ImmutableDatasetWriter(),
             batch_size=batch_size,
         )
-        self._episodes, self._poses = episodes, poses
+        self._episodes, self._poses, self._device = episodes, poses, device
 
     def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
         """Windows [B]; see :func:`window_buffer`."""
         frames, info = super().sample(batch_size, return_info=True)
-        windows = self.windows(frames, info)
+        windows = to_device(self.windows(frames, info), self._device)
         self._episodes.reading.add(frames.bytes(), self._episodes.video[0])
         return (windows, info) if return_info else windows
 
@@ -199,7 +204,8 @@ def window_buffer(
 
     A sample is a TensorDict [B] as :class:`~worldenv_trl.world_models.Window` reads it: ``("frames", entry)`` uint8
     [B, K, 3, H, W] of each camera, ``poses`` [B, K, 13] predicted by forward kinematics, ``number`` int64 [B, K],
-    ``start`` int64 [B, 1], ``actions`` [B, n C, 7], ``step_mask`` bool [B, n C] and ``language_instruction``.
+    ``start`` int64 [B, 1], ``actions`` [B, n C, 7], ``step_mask`` bool [B, n C] and ``language_instruction``. Samples
+    are drawn on the CPU, where the frames are, and go to the device of ``world_model``.
 
     Args:
         episodes: of one store; its frames may be on disk.
@@ -230,7 +236,8 @@ def window_buffer(
     episodes.require("the world model", world_model.cameras, world_model.image_size)
     episodes = episodes.through(world_model.cameras)
     sampler = WindowSampler(episodes, world_model, **options)
-    return WindowBuffer(episodes, predicted_poses(episodes, kinematics), sampler, batch_size)
+    poses = predicted_poses(episodes, kinematics)
+    return WindowBuffer(episodes, poses, sampler, batch_size, device_of(world_model))
 
 
 def _window_weights(episodes: Episodes, starts: Tensor, failure_share: float | None) -> Tensor:

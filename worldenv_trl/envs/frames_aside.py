@@ -70,7 +70,7 @@ class FramesAside(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self._folder is not None:
-            shown = next_tensordict.select(FRAMES)
+            shown = next_tensordict.select(FRAMES).cpu()
             check_room(self._folder.name, shown.bytes(), "the frames of a decision")
             self._decisions.append(shown.memmap(f"{self._folder.name}/{len(self._decisions)}"))
             release(self._decisions[-1])

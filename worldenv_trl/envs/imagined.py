@@ -9,6 +9,7 @@ from tensordict import NonTensorStack, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from worldenv_trl.devices import to_device
 from worldenv_trl.envs.context_sampler import ContextSampler
 from worldenv_trl.envs.contexts import ContextOrder, check_contexts, context_keys
 from worldenv_trl.envs.imagined_specs import imagined_specs
@@ -65,7 +66,7 @@ class ImaginedEnv(EnvBase):
         proprio: ``"commanded"`` writes the accumulated target pose as the state (the same number as in physics),
             ``"measured"`` the pose of the predicted joints.
         seed: of the contexts' order and of the noise; drawn from torch's generator when None.
-        device: of the specs and buffers; the contexts' when None.
+        device: of the specs and buffers; the contexts' when None. World model and kinematics must be there, too.
         context_sampler: draws the contexts of each task by how mixed their groups were, instead of in shuffled passes.
 
     A reset of a whole group draws its next context, the tasks in turn and without replacement while that is possible;
@@ -108,8 +109,9 @@ class ImaginedEnv(EnvBase):
             raise ValueError(f"max_steps must be at least 1, got {max_steps}")
         if proprio not in ("commanded", "measured"):
             raise ValueError(f'proprio must be "commanded" or "measured", got {proprio!r}')
-        check_contexts(contexts, kinematics, world_model.cameras, world_model.image_size)
         device = torch.device(device or contexts.device or "cpu")
+        contexts = to_device(contexts, device)
+        check_contexts(contexts, kinematics, world_model.cameras, world_model.image_size)
         super().__init__(device=device, batch_size=batch)
 
         self.world_model, self.kinematics = world_model, kinematics
@@ -191,7 +193,8 @@ class ImaginedEnv(EnvBase):
         if mask is None:
             mask = torch.ones(groups, rollouts, dtype=torch.bool, device=self.device)
         mask = mask.reshape(groups, rollouts).clone()
-        whole = [group for group in range(groups) if mask[group].all() or not self._begun[group]]
+        full = mask.all(1).tolist()
+        whole = [group for group in range(groups) if full[group] or not self._begun[group]]
         mask[whole] = True
         rows = mask.flatten().nonzero().squeeze(-1)
         self._resets[rows] += 1

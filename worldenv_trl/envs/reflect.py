@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import Transform
 
+from worldenv_trl.devices import device_of
 from worldenv_trl.keys import (
     FRAMES,
     INSTRUCTION,
@@ -34,7 +35,8 @@ class Reflect(Transform):
 
     Over :class:`ImaginedEnv` all frames of a chunk are scored in one batch; the rule ends the row *inside* the chunk:
     ``step_mask`` is False behind it, and images, states and ``num_steps`` are those of the frame that ended it. Over a
-    step-level :class:`TabletopEnv` each frame is scored as it comes (put :func:`chunked` around it, not inside).
+    step-level :class:`TabletopEnv` each frame is scored as it comes (put :func:`chunked` around it, not inside). Frames
+    go to the reflector's device, scores come back to the env's.
 
     ``reward`` is 0 until the rollout ends, for whatever reason, and then R(o_1:t, g) (World-Env section 3.3);
     ``success_prob`` is the score of the last frame.
@@ -106,10 +108,11 @@ class Reflect(Transform):
         if len(rows):
             goals = instructions_of(tensordict_reset)
             goals = [goals[row] for row in rows.tolist()]
-            state = self.reflector.begin({camera: shown[rows] for camera, shown in images.items()}, goals)
+            there = device_of(self.reflector, device)
+            state = self.reflector.begin({camera: shown[rows].to(there) for camera, shown in images.items()}, goals)
             self._check("begin", "state['score']", tuple(state["score"].shape), (len(rows),))
             memory["state"] = _merged(memory["state"], rows, state, count)
-            memory["prob"][rows], memory["streak"][rows] = state["score"].float(), 0
+            memory["prob"][rows], memory["streak"][rows] = state["score"].float().to(device), 0
         tensordict_reset[SUCCESS_PROB] = memory["prob"].reshape(*batch, 1).clone()
         return tensordict_reset
 
@@ -147,7 +150,8 @@ class Reflect(Transform):
         frames = {}
         for camera in self.reflector.cameras:
             video = _by_row(shown, frames_key(camera)) if chunk else _by_row(shown, image_key(camera)).unsqueeze(1)
-            frames[camera] = video if len(rows) == len(video) else video[rows]
+            video = video if len(rows) == len(video) else video[rows]
+            frames[camera] = video.to(device_of(self.reflector, video.device))
         return frames
 
     def _judge(self, rows: Tensor, frames: dict[str, Tensor], executed: Tensor) -> tuple[Tensor, Tensor]:
@@ -156,7 +160,7 @@ class Reflect(Transform):
         # Frames behind a row's end are extended by, too: the row is not stepped again before its reset.
         state, scores = self.reflector.extend(memory["state"] if len(rows) == whole else memory["state"][rows], frames)
         self._check("extend", "scores", tuple(scores.shape), tuple(executed.shape))
-        scores = scores.float()
+        scores = scores.float().to(executed.device)
         memory["state"] = _merged(memory["state"], rows, state, whole)
         stop, last, streak = self.rule.extend(memory["streak"][rows], scores, executed)
         if not self.stops:

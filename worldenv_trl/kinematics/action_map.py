@@ -102,7 +102,7 @@ class ActionMap(nn.Module):
             return torch.zeros(batch, dtype=torch.int64, device=self._position.device)
         if camera_index.is_floating_point() or camera_index.is_complex() or camera_index.dtype == torch.bool:
             raise ValueError(f"camera_index must be whole numbers, got {camera_index.dtype}")
-        index = camera_index.to(self._position.device).long()
+        index = camera_index.long()
         if index.shape != batch and index.ndim and index.shape[-1] == 1:
             index = index.squeeze(-1)
         if index.shape != batch[: index.ndim]:
@@ -115,6 +115,7 @@ class ActionMap(nn.Module):
             raise ValueError(
                 f"camera_index must be in [0, {count}), the cameras of this map, got {int(index[wrong][0])}"
             )
+        index = index.to(self._position.device)  # checked where it was: what comes from a CPU stops no GPU
         return index.reshape(*index.shape, *[1] * (len(batch) - index.ndim)).expand(batch)
 
     def _views(self, index: Tensor, tool_pose: Tensor | None) -> tuple[Tensor, Tensor]:

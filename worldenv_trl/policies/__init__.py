@@ -3,11 +3,13 @@
 from worldenv_trl.policies.actor import LaplaceActor, laplace_actor, likelihood_actor, scale_bounds
 from worldenv_trl.policies.augmentation import random_shift
 from worldenv_trl.policies.base import Policy
+from worldenv_trl.policies.device_bridge import DeviceBridge
 from worldenv_trl.policies.laplace import IndependentLaplace
 from worldenv_trl.policies.oft import OFTConfig, OFTPolicy
 from worldenv_trl.policies.pairing import check_pairing
 
 __all__ = [
+    "DeviceBridge",
     "IndependentLaplace",
     "LaplaceActor",
     "OFTConfig",

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor
 
+from worldenv_trl.devices import device_of
 from worldenv_trl.keys import TASK_ID, frames_key, image_entry
 from worldenv_trl.reflectors.base import Lesson
 
@@ -62,18 +63,18 @@ class CompactLessons:
 def lessons_of(reflector: CompactReflector, episodes: Episodes) -> Iterator[Lesson]:
     """See :meth:`CompactReflector.train_on`; what is wrong with the episodes is said before the first lesson."""
     _check(reflector, episodes)
-    plan, draw = reflector.lessons, FrameSampler(episodes)
+    plan, draw, device = reflector.lessons, FrameSampler(episodes), device_of(reflector)
     words = reflector.vocabulary.ids(episodes.instructions)  # [R, L]
 
     def batch(row: Tensor, frame: Tensor) -> TensorDict:
         label = episodes["success"][row, frame].unsqueeze(-1)
-        return TensorDict({"words": words[row], "label": label}, batch_size=[len(row)])
+        return TensorDict({"words": words[row].to(device), "label": label.to(device)}, batch_size=[len(row)])
 
     def frames() -> TensorDict:
         row, frame = draw(2 * plan.batch_size)
         out = batch(row, frame)
         for camera in reflector.cameras:
-            now, first = (episodes.frames(camera, row, at) for at in (frame, torch.zeros_like(frame)))
+            now, first = (episodes.frames(camera, row, at).to(device) for at in (frame, torch.zeros_like(frame)))
             now, first = _shifted_together(torch.cat([now, first], 1)).split(3, 1)
             now, first = blurred(now, float(torch.rand(()))), blurred(first, float(torch.rand(())))
             out[frames_key(camera)] = now + _PIXEL_NOISE * torch.randn_like(now)
@@ -87,7 +88,7 @@ def lessons_of(reflector: CompactReflector, episodes: Episodes) -> Iterator[Less
         def prefixes() -> TensorDict:
             row, frame = draw(2 * plan.batch_size)
             out = batch(row, frame)
-            sampled, used = reflector.sample_prefixes(features, row, frame + 1)
+            sampled, used = reflector.sample_prefixes(features, row.to(device), frame.to(device) + 1)
             out["features"] = sampled + _FEATURE_NOISE * torch.randn_like(sampled)
             out["lengths"] = used.unsqueeze(-1)
             return out
@@ -136,13 +137,13 @@ class FrameSampler:
 
 
 def encode_all(reflector: CompactReflector, episodes: Episodes) -> Tensor:
-    """Features [R, T + 1, F] of all frames, 0 past an episode's end."""
-    alive = episodes.alive
-    features = torch.zeros(*alive.shape, reflector.config.feature_dim)
+    """Features [R, T + 1, F] of all frames, on the reflector's device, 0 past an episode's end."""
+    alive, device = episodes.alive, device_of(reflector)
+    features = torch.zeros(*alive.shape, reflector.config.feature_dim, device=device)
     for rows in torch.arange(len(episodes)).split(_EPISODES_AT_ONCE):
         row, frame = alive[rows].nonzero(as_tuple=True)
         row = rows[row]
-        shown = {camera: episodes.frames(camera, row, frame) for camera in reflector.cameras}
+        shown = {camera: episodes.frames(camera, row, frame).to(device) for camera in reflector.cameras}
         features[row, frame] = reflector.encode(shown)
     return features
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-__all__ = ["add_noise", "sample", "seeded_noise"]
+from worldenv_trl.splitmix import splitmix64
+
+__all__ = ["add_noise", "counted_noise", "sample", "seeded_noise"]
 
 
 def add_noise(clean: Tensor, noise: Tensor, level: Tensor) -> Tensor:
@@ -38,11 +41,36 @@ def sample(predict: Callable[[Tensor, Tensor], Tensor], noise: Tensor, num_steps
 
 
 def seeded_noise(seed: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Standard normal noise [B, *shape], row by row a function of its own seed alone.
+    """Standard normal noise [B, *shape] on the seed's device, row by row a function of its own seed alone.
+
+    On a CPU each row has a generator of its own; elsewhere :func:`counted_noise` draws all rows at once. The same seed
+    gives other noise there.
 
     Args:
         seed: int64 [B] or [B, 1], not negative.
         shape: of one row.
     """
+    if seed.device.type != "cpu":
+        return counted_noise(seed, shape)
     rows = [torch.randn(shape, generator=torch.Generator().manual_seed(value)) for value in seed.flatten().tolist()]
-    return torch.stack(rows).to(seed.device) if rows else torch.zeros(0, *shape, device=seed.device)
+    return torch.stack(rows) if rows else torch.zeros(0, *shape)
+
+
+def counted_noise(seed: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Standard normal noise [B, *shape] by counting: element i of a row is a hash of the row's seed and i.
+
+    Nothing is drawn one row after the other, and nothing is asked of the host: what a GPU needs.
+
+    Args:
+        seed: int64 [B] or [B, 1].
+        shape: of one row.
+    """
+    count = math.prod(shape)
+    pairs = torch.arange(-(-count // 2), device=seed.device)
+    bits = splitmix64(splitmix64(seed.reshape(-1, 1)) ^ splitmix64(pairs + 1))  # [B, pairs]
+    # 24 bits each, what a float32 holds; the radius must not be that of 0.
+    first = (((bits >> 40) & (2**24 - 1)).float() + 1) * 2.0**-24  # (0, 1]
+    second = ((bits >> 8) & (2**24 - 1)).float() * 2.0**-24  # [0, 1)
+    radius, angle = (-2 * first.log()).sqrt(), 2 * math.pi * second  # Box and Muller 1958
+    normal = torch.stack([radius * angle.cos(), radius * angle.sin()], -1).flatten(1)[:, :count]
+    return normal.reshape(len(normal), *shape)

@@ -35,6 +35,7 @@ __all__ = ["VideoWorldModel", "VideoWorldModelConfig"]
 
 _MEMORY = 3  # first frame, the frame memory_stride back, last frame
 _PIXELS_AT_ONCE = 2**17  # of a frame, all rows and cameras: half of it and twice as many are slower at 128 px
+_PIXELS_AT_ONCE_ON_GPU = 2**20  # 256 rows of 64 px: filled with work, and a few GB
 _POSITION_SCALE = 10.0  # metres to the unit scale of the network's other inputs
 
 
@@ -62,8 +63,8 @@ class VideoWorldModelConfig:
     """``float32``, ``bfloat16`` (autocast) or ``auto``: bfloat16 where there is hardware for it (GPU, CPU with AMX). On
     a CPU without AMX bfloat16 convolutions take 1.8 times as long as float32 ones."""
     rows_per_call: int | None = None
-    """Rows that pass through the network at once at inference; few enough keep the activations inside the CPU cache.
-    None is 16, or fewer of larger images."""
+    """Rows that pass through the network at once at inference; few enough keep the activations inside a CPU's cache,
+    many keep a GPU busy. None is 16 on a CPU and 256 on a GPU, or fewer of larger images."""
     unroll_prob: float = 0.5
     """In training, share of the later chunks of a window that remember the model's own frames."""
     noise_prob: float | None = None
@@ -116,11 +117,14 @@ class VideoWorldModelConfig:
         }
         return cls(cameras=plain, **settings)
 
-    @property
-    def rows_at_once(self) -> int:
-        """:attr:`rows_per_call`, or what it is when that is None."""
+    def rows_at_once(self, device: torch.device | str = "cpu") -> int:
+        """:attr:`rows_per_call`, or what it is on ``device`` when that is None."""
+        if self.rows_per_call is not None:
+            return self.rows_per_call
         pixels = self.image_size**2 * max(1, len(self.cameras))
-        return self.rows_per_call or min(16, max(1, _PIXELS_AT_ONCE // pixels))
+        if torch.device(device).type == "cpu":
+            return min(16, max(1, _PIXELS_AT_ONCE // pixels))
+        return max(1, _PIXELS_AT_ONCE_ON_GPU // pixels)
 
     @property
     def instructions(self) -> tuple[str, ...]:
@@ -196,7 +200,7 @@ class VideoWorldModel(WorldModel, Pretrained):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._check(tensordict)
-        texts, rows = instructions_of(tensordict), self.config.rows_at_once
+        texts, rows = instructions_of(tensordict), self.config.rows_at_once(tensordict[POSES].device)
         shape, device = (len(texts), self.chunk_length, 3, self.image_size, self.image_size), tensordict[POSES].device
         frames = {camera: torch.empty(shape, dtype=torch.uint8, device=device) for camera in self.cameras}
         with torch.no_grad():
@@ -239,10 +243,10 @@ class VideoWorldModel(WorldModel, Pretrained):
         """What one camera shows; ``every`` [B, M + C, 13] are the poses of memory and chunk."""
         camera, calibrations = self.cameras[index], self._views[index]
         action_map = cast(ActionMap, self.action_maps[index])
-        which = calibrations.indices(texts)  # [B]
-        mounted = calibrations.mounted[which].to(every.device).view(-1, 1, 1)
-        which, poses, size = which.to(every.device), every[:, _MEMORY:], self.image_size
+        which = calibrations.indices(texts)  # [B], on the CPU: it is checked there, and a GPU does not wait
+        poses, size = every[:, _MEMORY:], self.image_size
         if calibrations.any_mounted:
+            mounted = calibrations.mounted[which].to(every.device).view(-1, 1, 1)
             seen_from = every[:, _MEMORY - 1 : _MEMORY].expand_as(every)  # the camera, as it saw the last frame
             drawn = {"tool_pose": seen_from}
             carried = torch.where(mounted, poses, seen_from[:, _MEMORY:])
@@ -268,10 +272,11 @@ class VideoWorldModel(WorldModel, Pretrained):
 
         Both are float cells [B, V, C, 3, patch^2, h, w] of images in [-1, 1], see :func:`to_cells`.
         """
-        with torch.autocast(level.device.type, torch.bfloat16, enabled=self._bfloat16(level.device)):
+        with torch.autocast(level.device.type, torch.bfloat16, enabled=self.predicts_in_bfloat16(level.device)):
             return self.denoiser(noisy, level, **conditions)
 
-    def _bfloat16(self, device: torch.device) -> bool:
+    def predicts_in_bfloat16(self, device: torch.device) -> bool:
+        """Whether the network runs in bfloat16 on ``device``; see :attr:`VideoWorldModelConfig.precision`."""
         if self.config.precision == "auto":
             return device.type != "cpu" or torch.cpu._is_amx_tile_supported()
         return self.config.precision == "bfloat16"

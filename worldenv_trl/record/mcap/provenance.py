@@ -17,6 +17,8 @@ from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import TransformedEnv
 
+from worldenv_trl.devices import device_of
+
 if TYPE_CHECKING:
     from worldenv_trl.scenes import Task
 
@@ -48,7 +50,8 @@ def provenance(
         ValueError: if two tasks have one ``task_id``.
 
     Returns:
-        ``metadata``: ``versions`` of packages; ``threads`` of torch; ``models``, name -> :func:`model_hash`;
+        ``metadata``: ``versions`` of packages; ``threads`` of torch; ``models``, name -> :func:`model_hash`, and the
+        ``device`` they were on, ``cpu`` or ``cuda``;
         ``config``; ``tasks``, their names, with ``task_ids`` (what the entry ``task_id`` calls them), ``digests`` and
         ``instructions``; ``env``, its class and settings; ``calibration``, by task and camera. ``attachments``: for
         each task ``<k>.mjcf`` (the scene as text), ``<k>.mjb`` (the compiled scene, which the same version of MuJoCo
@@ -58,6 +61,7 @@ def provenance(
     attachments: dict[str, bytes] = {}
     if models:
         metadata["models"] = {name: model_hash(model) for name, model in models.items()}
+        metadata["device"] = next(device_of(model).type for model in models.values())
     if config is not None:
         metadata["config"] = _plain(config)
     base, own = env, {}  # task_id by name

@@ -78,14 +78,17 @@ class Branch:
     @torch.no_grad()
     def decide(self, tensordict: TensorDictBase) -> Tensor:
         """The policy's chunk [*B, C, 7]."""
+        from worldenv_trl.policies import DeviceBridge  # reading needs no policies
+
         assert self.policy is not None
+        acting = DeviceBridge(self.policy) if isinstance(self.policy, TensorDictModuleBase) else self.policy
         mode = ExplorationType.DETERMINISTIC if self.seed is None else ExplorationType.RANDOM
         training = [m for m in self.policy.modules() if m.training] if isinstance(self.policy, nn.Module) else []
         try:
             for module in training:
                 module.training = False
             with set_exploration_type(mode):
-                return self.policy(tensordict.copy())[CHUNK]
+                return acting(tensordict.copy())[CHUNK]
         finally:
             for module in training:
                 module.training = True

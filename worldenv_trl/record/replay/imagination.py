@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.envs.transforms import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
+from worldenv_trl.devices import device_of, to_device
 from worldenv_trl.keys import (
     ACTION_DIM,
     CHUNK,
@@ -54,11 +55,13 @@ def replay_imagination(
     are rounded as they were. With a ``branch`` (one row), decisions before it show the recorded frames.
 
     Returns:
-        Decision-level entries [R, D'], with a mask.
+        Decision-level entries [R, D'], with a mask, on the CPU; they are made on the world model's device.
     """
     from worldenv_trl.envs import ImaginedEnv, Reflect
     from worldenv_trl.kinematics import ForwardKinematics
 
+    device = device_of(world_model)
+    rollouts = to_device(rollouts, device)
     chunks, active = rollouts[CHUNK], rollouts[MASK]
     count, length = chunks.shape[0], chunks.shape[2]
     turn = None if branch is None else branch.step // length
@@ -70,7 +73,7 @@ def replay_imagination(
     seed = 0 if branch is None or branch.seed is None else branch.seed
     env = ImaginedEnv(
         directed,
-        ForwardKinematics(),
+        ForwardKinematics().to(device),
         contexts,
         [count // group, group],
         max_steps=max_steps,
@@ -91,7 +94,7 @@ def replay_imagination(
         if branch is not None:  # it is at a whole decision
             branch.direct(reflect, rule, branch.step if behind else -1)
         if branch is not None and behind and branch.policy is not None:
-            chunk, rows = branch.decide(td), torch.ones(count, dtype=torch.bool)
+            chunk, rows = branch.decide(td), torch.ones(count, dtype=torch.bool, device=device)
             if chunk.shape[-2] != length:
                 raise ValueError(f"the policy's chunks have {chunk.shape[-2]} actions, the world model's {length}")
             chunk = chunk.reshape(count, length, ACTION_DIM)
@@ -112,7 +115,7 @@ def replay_imagination(
         td = step_mdp(out, exclude_action=True)
     played: TensorDict = torch.stack(entries, -1).reshape(count, len(entries))
     played[MASK] = torch.stack(masks, -1)
-    return played
+    return to_device(played, torch.device("cpu"))
 
 
 class _Directed(WorldModel):
@@ -127,7 +130,7 @@ class _Directed(WorldModel):
         known = turn is not None and all(("next", *key) in have for key in wanted)
         self._frames = {key: rollouts["next", *key] for key in wanted} if known else {}
         self._turn, self._reseeded = turn, reseeded
-        self.used = torch.zeros(rollouts.shape[0], 1, dtype=torch.int64)
+        self.used = torch.zeros(rollouts.shape[0], 1, dtype=torch.int64, device=rollouts[CHUNK].device)
 
     def memory_indices(self, now: Tensor) -> Tensor:
         return self.model.memory_indices(now)
@@ -141,7 +144,7 @@ class _Directed(WorldModel):
         past = self._turn is not None and self._decision >= self._turn
         if self._seeds is not None and self._decision < self._seeds.shape[1] and not (past and self._reseeded):
             tensordict[NOISE_SEED] = self._seeds[self._rows, self._decision]
-        self.used[self._rows] = tensordict[NOISE_SEED].cpu()
+        self.used[self._rows] = tensordict[NOISE_SEED]
         if not self._frames or past:
             return self.model(tensordict)
         for key, frames in self._frames.items():

@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from worldenv_trl.devices import device_of
 from worldenv_trl.keys import FRAMES, MASK, SUCCESS, SUCCESS_PROB
 from worldenv_trl.record.mcap.provenance import model_hash, package_versions
 from worldenv_trl.record.mcap.reader import list_rollouts, read_attachments, read_rollouts
@@ -120,6 +121,7 @@ def replay(
     same = _same_versions(source, notes) and source.imagined == (mode == "imagination")
     if mode == "imagination" and source.imagined and world_model is not None:
         same = _same_model(source, "world_model", world_model, notes) and same
+        same = _same_device(source, device_of(world_model).type, notes) and same
     if reflector is not None:
         same = _same_model(source, "reflector", reflector, notes) and same
     if kind == "exact" and (source.imagined != (mode == "imagination") or not same):
@@ -290,6 +292,16 @@ def _same_model(source: Source, name: str, model: torch.nn.Module, notes: list[s
     return recorded == given
 
 
+def _same_device(source: Source, given: str, notes: list[str]) -> bool:
+    recorded = source.metadata.get("device", given)
+    if recorded != given:
+        notes.append(
+            f"recorded on {recorded}, replayed on {given}: sums are rounded and noise is drawn otherwise there; "
+            "equality is not claimed"
+        )
+    return recorded == given
+
+
 def _outcome(entries: TensorDict, first: int = 0) -> dict[str, float | bool | int]:
     out: dict[str, float | bool | int] = {}
     have = set(entries.keys(True, True))
@@ -339,7 +351,7 @@ def _write(
         # Equal frames have an infinite PSNR, which no viewer plots.
         psnr = torch.tensor([min(report.psnr.get(step, float("nan")), 100.0) for step in shown.tolist()])
         played["next", "recorded", "psnr"] = psnr.reshape(len(played), chunk)
-    imagined = report.mode == "imagination"
+    imagined, taking_part = report.mode == "imagination", [model for model in models.values() if model is not None]
     described = dict(source.metadata) | {
         "versions": package_versions(),
         "models": {name: model_hash(model) for name, model in models.items() if model is not None},
@@ -355,6 +367,8 @@ def _write(
             "report": report.to_json(),
         },
     }
+    if taking_part:
+        described["device"] = device_of(taking_part[0]).type
     with RolloutWriter(
         target, metadata=described, attachments=read_attachments(source.path), overwrite=overwrite
     ) as writer:
