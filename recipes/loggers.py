@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import io
 import os
 import sys
 import tempfile
@@ -23,9 +24,11 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.record.loggers import CSVLogger, Logger, MLFlowLogger, TensorboardLogger, WandbLogger
 
+from worldenv_trl import keys
 from worldenv_trl.data import episodes_from_rollouts
 from worldenv_trl.record import MCAPLogger, read_rollouts
 from worldenv_trl.report import video_webm
@@ -60,8 +63,15 @@ def _tensorboard_image(logger: Logger, name: str, path: Path) -> None:
 
 
 def _tensorboard_video(logger: Logger, name: str, video: Tensor) -> None:
-    if importlib.util.find_spec("moviepy") is not None:  # TensorBoard's writer cannot encode without
-        logger.log_video(name, video[None], 0, fps=FPS)
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    # TensorBoard shows a GIF as an image; log_video would need moviepy older than 2, and drops the video without.
+    first, *more = (Image.fromarray(frame) for frame in video.permute(0, 2, 3, 1).contiguous().numpy())
+    encoded = io.BytesIO()
+    first.save(encoded, "GIF", save_all=True, append_images=more, duration=1000 // FPS, loop=0)
+    size = {"height": first.height, "width": first.width, "colorspace": 3}
+    image = Summary.Image(encoded_image_string=encoded.getvalue(), **size)
+    logger.experiment.file_writer.add_summary(Summary(value=[Summary.Value(tag=name, image=image)]), 0)
 
 
 def _tensorboard_settings(logger: Logger, settings: dict[str, Any]) -> None:
@@ -251,14 +261,12 @@ class Loggers:
         """The first rollout of each recording as a video of every camera."""
         for path in sorted(paths) if self.loggers else ():
             try:
-                episode = episodes_from_rollouts(read_rollouts(path, rollouts=slice(0, 1)))
-            except (ValueError, OSError) as error:  # no video in it, or damaged: no matter for the run
+                films = _films(read_rollouts(path, rollouts=slice(0, 1)))
+            except (ValueError, OSError) as error:  # damaged since: no matter for the run
                 warnings.warn(f"{path.name} is not logged as a video: {error}", stacklevel=2)
                 continue
-            frame = torch.arange(int(episode["length"][0]) + 1)
-            for camera in episode.cameras:
-                video, name = episode.frames(camera, torch.zeros_like(frame), frame), f"videos/{path.stem}_{camera}"
-                self._each(lambda kind: kind.video, name, video)
+            for camera, video in films.items():
+                self._each(lambda kind: kind.video, f"videos/{path.stem}_{camera}", video)
 
     def page(self, path: Path) -> None:
         """An HTML file, if it is there."""
@@ -278,6 +286,20 @@ class Loggers:
             except Exception as error:  # its server is gone, the disk is full, ...
                 del self.loggers[name]
                 print(f"warning: the logger {name} failed and is left out: {_said(error)}", file=sys.stderr)
+
+
+def _films(rollouts: TensorDictBase) -> dict[str, Tensor]:
+    """Frames uint8 ``[T, 3, H, W]`` of every camera of one rollout ``[1, D]``: all, or those at decisions if no more
+    were recorded.
+    """
+    try:
+        episode = episodes_from_rollouts(rollouts)
+    except ValueError:
+        rows = rollouts[keys.MASK] if keys.MASK in rollouts.keys(True) else torch.ones(rollouts.shape, dtype=torch.bool)
+        seen = {name: value for name, value in rollouts["observation"].items() if value.dtype == torch.uint8}
+        return {keys.camera_of(name): images[rows] for name, images in seen.items()}
+    frame = torch.arange(int(episode["length"][0]) + 1)
+    return {camera: episode.frames(camera, torch.zeros_like(frame), frame) for camera in episode.cameras}
 
 
 def _log(logger: Logger, numbers: dict[str, float], step: int) -> None:

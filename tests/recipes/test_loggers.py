@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
+import io
 import os
 import struct
 
@@ -18,7 +18,7 @@ from config import PRESETS
 from loggers import Loggers
 from run_folder import RunFolder
 from stages import open_run
-from worldenv_trl.envs import TabletopEnv
+from worldenv_trl.envs import TabletopEnv, chunked
 from worldenv_trl.record import RolloutWriter, provenance
 
 LINE = {"protocol": "physics", "policy": "sft", "task": "starter/open_the_top_drawer", "success": 0.25, "paired": True}
@@ -132,8 +132,10 @@ def test_tensorboard_shows_scalars_and_pictures(tmp_path, recording):
     events = EventAccumulator(str(folder.path / "logs" / "001" / "tensorboard"), size_guidance={"images": 0})
     events.Reload()
     assert [(each.step, each.value) for each in events.Scalars(NAME)] == [(0, 0.25), (1, 0.5)]
-    videos = ["videos/demo_agentview", "videos/demo_wrist"] if importlib.util.find_spec("moviepy") else []
-    assert sorted(events.Tags()["images"]) == ["plots/losses", *videos]
+    assert sorted(events.Tags()["images"]) == ["plots/losses", "videos/demo_agentview", "videos/demo_wrist"]
+    (shown,) = events.Images("videos/demo_agentview")
+    film = Image.open(io.BytesIO(shown.encoded_image_string))
+    assert film.format == "GIF" and film.size == (16, 16) and film.n_frames > 1
     assert "settings/text_summary" in events.Tags()["tensors"]
 
 
@@ -191,6 +193,19 @@ def test_a_stage_shows_a_rollout_of_what_it_recorded_and_of_nothing_else(tmp_pat
     assert videos == {"explore_agentview_0.pt", "explore_wrist_0.pt"}
     saved = torch.load(next((folder.path / "logs").rglob("explore_agentview_0.pt")), weights_only=True)
     assert torch.equal(saved[0], recording[1])
+
+
+def test_of_rollouts_recorded_by_decision_the_frames_at_decisions_are_shown(tmp_path):
+    env = chunked(TabletopEnv("starter/open_the_top_drawer", 2, image_size=16, seed=0, num_threads=1), 4)
+    rollouts = env.rollout(3)
+    with RolloutWriter(tmp_path / "evaluate.mcap", **provenance(env)) as writer:
+        writer.write(rollouts)
+    env.close()
+    folder = opened(tmp_path, "csv")
+    folder.loggers.recordings([tmp_path / "evaluate.mcap"])
+    (saved,) = (folder.path / "logs").rglob("*.pt")
+    assert saved.name == "evaluate_agentview_0.pt"
+    assert torch.equal(torch.load(saved, weights_only=True)[0], rollouts[0]["observation", "image"])
 
 
 def test_a_logger_that_fails_is_left_out_with_one_line_and_the_others_go_on(tmp_path, capsys, monkeypatch):
