@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-import torch
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -56,6 +55,7 @@ class Benchmark:
     """Between two checkpoints."""
     seed: int = 0
     """Of the moments and of the run."""
+    num_threads: int = 1
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def small(path: Path, settings: Benchmark) -> WorldEnvConfig:
         PRESETS["smoke"][1],
         run_dir=path,
         seed=settings.seed,
-        num_threads=1,
+        num_threads=settings.num_threads,
         checkpoint_minutes=settings.minutes,
         tasks=GOAL_TASKS[1:2],
         train_states=8,
@@ -87,7 +87,6 @@ def small(path: Path, settings: Benchmark) -> WorldEnvConfig:
 
 def work(config: WorldEnvConfig) -> None:
     """What a process does."""
-    torch.set_num_threads(config.num_threads)
     run_stages(open_run(config), WORKS)
 
 
@@ -108,8 +107,11 @@ def killed_run(config: WorldEnvConfig, stage_seconds: dict[str, float], settings
     """Kills as many processes as asked for, then lets the last one finish."""
     draw, folder, kills = random.Random(settings.seed), RunFolder(config.run_dir), []
     names = list(stage_seconds)
-    for number in range(settings.kills):
-        place = number * len(names) // settings.kills
+    while len(kills) < settings.kills:
+        place = len(kills) * len(names) // settings.kills
+        if folder.done(names[place]):  # nothing would be left to kill of it
+            for name in names[place:]:
+                folder.forget(name)
         before = _written(folder)
         process = started(config)
         # A stage that begins writes the metrics anew.
@@ -118,8 +120,8 @@ def killed_run(config: WorldEnvConfig, stage_seconds: dict[str, float], settings
         begun = time.time()
         process.join(draw.uniform(0.0, stage_seconds[names[place]]))
         if not process.is_alive():
-            ended(process)  # the whole run is finished
-            break
+            ended(process)  # faster than it was without a break: once more
+            continue
         process.kill()
         at = time.time()
         process.join()
@@ -129,7 +131,7 @@ def killed_run(config: WorldEnvConfig, stage_seconds: dict[str, float], settings
         kept = [path.stat().st_mtime for path in folder.progress(stage).glob("*.torchrl")]
         kept += [(folder.path / "stages" / name).stat().st_mtime for name in names if folder.done(name)]
         kills.append(Kill(stage, at - max([begun, *(moment for moment in kept if moment < at)])))
-        print(f"kill {number + 1} in {stage}, {kills[-1].lost:.1f} s lost", flush=True)
+        print(f"\nkill {len(kills)} in {stage}, {kills[-1].lost:.1f} s lost", flush=True)
     ended(started(config))
     return kills
 
@@ -160,6 +162,7 @@ def _timeless(line: dict) -> str:
 def main(settings: Benchmark) -> None:
     with refusals():
         at_least(0, kills=settings.kills, seed=settings.seed)
+        at_least(1, num_threads=settings.num_threads)
         if not settings.minutes >= 0:
             raise ValueError(f"--minutes must be at least 0, got {settings.minutes}")
     with tempfile.TemporaryDirectory() as name:
