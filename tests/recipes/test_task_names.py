@@ -39,7 +39,7 @@ def test_numbers_that_are_too_small_are_named_like_their_options():
 
 
 def test_other_errors_keep_their_traceback():
-    with pytest.raises(SystemExit, match="error: .*no such file"), refusals():
+    with pytest.raises(SystemExit, match=r"error: .*no such file"), refusals():
         Path("no such file").read_text()
     with pytest.raises(KeyError), refusals():
         raise KeyError("a mistake of ours")
