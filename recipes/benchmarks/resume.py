@@ -108,8 +108,11 @@ def killed_run(config: WorldEnvConfig, stage_seconds: dict[str, float], settings
     """Kills as many processes as asked for, then lets the last one finish."""
     draw, folder, kills = random.Random(settings.seed), RunFolder(config.run_dir), []
     names = list(stage_seconds)
-    for number in range(settings.kills):
-        place = number * len(names) // settings.kills
+    while len(kills) < settings.kills:
+        place = len(kills) * len(names) // settings.kills
+        if folder.done(names[place]):  # nothing would be left to kill of it
+            for name in names[place:]:
+                folder.forget(name)
         before = _written(folder)
         process = started(config)
         # A stage that begins writes the metrics anew.
@@ -118,8 +121,8 @@ def killed_run(config: WorldEnvConfig, stage_seconds: dict[str, float], settings
         begun = time.time()
         process.join(draw.uniform(0.0, stage_seconds[names[place]]))
         if not process.is_alive():
-            ended(process)  # the whole run is finished
-            break
+            ended(process)  # faster than it was without a break: once more
+            continue
         process.kill()
         at = time.time()
         process.join()
@@ -129,7 +132,7 @@ def killed_run(config: WorldEnvConfig, stage_seconds: dict[str, float], settings
         kept = [path.stat().st_mtime for path in folder.progress(stage).glob("*.torchrl")]
         kept += [(folder.path / "stages" / name).stat().st_mtime for name in names if folder.done(name)]
         kills.append(Kill(stage, at - max([begun, *(moment for moment in kept if moment < at)])))
-        print(f"kill {number + 1} in {stage}, {kills[-1].lost:.1f} s lost", flush=True)
+        print(f"\nkill {len(kills)} in {stage}, {kills[-1].lost:.1f} s lost", flush=True)
     ended(started(config))
     return kills
 
