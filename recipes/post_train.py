@@ -68,7 +68,7 @@ def post_train(
         env = physics_waves_env(config, *shape, seed=run.seed(target, "env"), sampler=sampler)
     collector = GroupCollector(
         env,
-        actor if imagination else DeviceBridge(actor),
+        DeviceBridge(actor),
         groups_per_batch=settings.groups,
         total_groups=settings.iterations * settings.groups,
         group_size=settings.group_size,

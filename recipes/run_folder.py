@@ -29,7 +29,7 @@ from worldenv_trl.report import machine_versions
 
 MIN_FREE_GB = 1.0
 FREE = {"run_dir", "num_threads", "device", "checkpoint_minutes", "logger"}
-"""Settings that do not change what a run computes: it may be continued with others."""
+"""Settings of the machine at hand: a run may be continued with others. Only ``device`` changes noise and rounding."""
 
 
 class RunFolder:

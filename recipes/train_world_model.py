@@ -54,14 +54,8 @@ def _train(
         optimizer, lambda step: min(1.0, (step + 1) / 100) * (0.02 + 0.49 * (1 + math.cos(math.pi * step / steps)))
     )
     shown: dict[str, Any] = {"loss": None}  # its running mean
-    parts: dict[str, Any] = {
-        "model": model,
-        "optimizer": optimizer,
-        "schedule": schedule,
-        "windows": windows,
-        "shown": shown,
-    }
-    left = Resumable(run, "steps", steps, **parts)
+    parts: dict[str, Any] = {"model": model, "optimizer": optimizer, "schedule": schedule, "windows": windows}
+    left = Resumable(run, "steps", steps, shown=shown, **parts)
     progress, started, first = left.bar(target), time.monotonic(), left.step
     for step in progress:
         value = loss(windows.sample())["loss_world_model"]

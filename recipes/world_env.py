@@ -59,7 +59,7 @@ def summarize(run: Run) -> None:
         "physics: the goal predicate ends an episode; reflector: nothing but the reflector does."
     )
     episodes = max(min(config.evaluate.episodes_per_task // 5, report.Report.episodes_per_task), 1)
-    settings = report.Report(folder, episodes_per_task=episodes, num_threads=config.num_threads)
+    settings = report.Report(folder, episodes_per_task=episodes, num_threads=config.num_threads, device=config.device)
     try:
         report.write(settings, run.parts)
     except Exception as error:  # the run itself is whole

@@ -111,7 +111,7 @@ def test_a_local_folder_of_the_same_name_wins(no_hub):
 
 @pytest.mark.parametrize(
     "name",
-    ["runs/arm/checkpoints/sft", "./arm", "../some/arm", "~/arm", "/tmp/arm", "arm", "here/arm", Path("someone/arm")],
+    ["runs/arm/checkpoints/sft", "./arm", "../some/arm", "~/arm", "/some/arm", "arm", "here/arm", Path("someone/arm")],
 )
 def test_a_path_that_does_not_exist_is_said_to_be_missing_and_the_hub_is_not_asked(name, no_hub):
     Path("here").mkdir()

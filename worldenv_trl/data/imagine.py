@@ -109,9 +109,8 @@ def _imagine(
     real_until = min(shown - 1, steps // length) * length  # the last frame of which a real one is remembered
     truth = video.clone() if real_until else video
     for camera in world_model.cameras if real_until else ():
-        truth[frames_key(camera)][:, : real_until + 1] = episodes.frames(camera, row, torch.arange(real_until + 1)).to(
-            device
-        )
+        real = episodes.frames(camera, row, torch.arange(real_until + 1))
+        truth[frames_key(camera)][:, : real_until + 1] = real.to(device)
     for start in range(0, steps, length):
         chunk = torch.arange(start + 1, start + length + 1)
         if painted is not None and start < shown * length:
