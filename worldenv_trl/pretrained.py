@@ -37,7 +37,9 @@ class Pretrained(_Module):
     The module is built from one dataclass: ``__init__(self, config)`` accepts an instance of :attr:`config_class`
     alone and keeps it as ``self.config``. Parameters and persistent buffers are saved. A config is written with
     ``dataclasses.asdict`` (arrays as nested lists) and rebuilt as ``config_class(**fields)`` with lists turned into
-    tuples; a config with nested objects or non-string dictionary keys defines the classmethod ``from_dict(fields)``.
+    tuples; a config with nested objects or non-string dictionary keys defines the classmethod ``from_dict(fields)``. A
+    module that needs further files, a tokenizer's, names them in :attr:`companion_names`, writes them in
+    :meth:`companions` and reads them in :meth:`build`.
 
     Examples:
         >>> import dataclasses, tempfile, torch
@@ -57,12 +59,22 @@ class Pretrained(_Module):
     """
 
     config_class: ClassVar[type]
+    companion_names: ClassVar[tuple[str, ...]] = ()
     config: Any
 
-    def save_pretrained(self, folder: str | os.PathLike) -> Path:
-        """Writes ``config.json`` and ``model.safetensors`` into ``folder`` (created if missing) and returns it.
+    def companions(self) -> dict[str, bytes]:
+        """Contents of the files named in :attr:`companion_names`."""
+        return {}
 
-        Both files are complete on disk before either replaces an older one of the same name.
+    @classmethod
+    def build(cls, config: Any, folder: Path) -> Self:
+        """The module of a config that was read from ``folder``, before its weights are."""
+        return cls(config)
+
+    def save_pretrained(self, folder: str | os.PathLike) -> Path:
+        """Writes ``config.json``, ``model.safetensors`` and companions into ``folder`` and returns it.
+
+        The folder is made if it is missing. All files are complete on disk before any replaces an older one of the same name.
         """
         folder = Path(folder)
         if folder.exists() and not folder.is_dir():
@@ -76,7 +88,10 @@ class Pretrained(_Module):
             "weights_sha256": hashlib.sha256(weights).hexdigest(),
             "config": _to_json(dataclasses.asdict(self.config)),
         }
-        contents = {WEIGHTS_NAME: weights, CONFIG_NAME: (json.dumps(config, indent=2) + "\n").encode()}
+        contents = self.companions() | {
+            WEIGHTS_NAME: weights,
+            CONFIG_NAME: (json.dumps(config, indent=2) + "\n").encode(),
+        }
         temporary = {name: folder / f".{name}.{os.getpid()}.tmp" for name in contents}
         try:
             for name, data in contents.items():
@@ -133,12 +148,13 @@ class Pretrained(_Module):
             revision: branch, tag or commit of a repository; ``main`` when None.
 
         Raises:
-            FileNotFoundError: if the folder, one of its two files or the repository is missing.
+            FileNotFoundError: if the folder, one of its files or the repository is missing.
             ValueError: if the checkpoint is truncated, corrupt, or of another class or shape.
         """
         remote = hub.is_repo_id(name)
-        folder = hub.download(str(name), [CONFIG_NAME, WEIGHTS_NAME], revision=revision) if remote else Path(name)
-        for path in (folder, folder / CONFIG_NAME, folder / WEIGHTS_NAME):
+        files = [CONFIG_NAME, WEIGHTS_NAME, *cls.companion_names]
+        folder = hub.download(str(name), files, revision=revision) if remote else Path(name)
+        for path in (folder, *(folder / file for file in files)):
             if not path.exists():
                 writes = "repository that push_to_hub" if remote else f"folder that {cls.__name__}.save_pretrained"
                 raise FileNotFoundError(
@@ -149,7 +165,7 @@ class Pretrained(_Module):
         try:
             from_dict = getattr(cls.config_class, "from_dict", None)
             config = from_dict(fields) if from_dict else cls.config_class(**_to_tuples(fields))
-            module = cls(config)
+            module = cls.build(config, folder)
         except (TypeError, ValueError, KeyError) as error:
             raise ValueError(f"{folder / CONFIG_NAME} does not describe a {cls.__name__}: {error}") from error
         weights = (folder / WEIGHTS_NAME).read_bytes()

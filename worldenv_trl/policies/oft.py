@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from worldenv_trl.keys import ACTION_DIM, CHUNK_LENGTH, STATE_DIM
 from worldenv_trl.language import Vocabulary, split_words
 from worldenv_trl.policies.base import Policy
+from worldenv_trl.policies.heads import MLPResNet
 from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.vision import PretrainedEncoder
 
@@ -221,29 +222,6 @@ class _Backbone(nn.Module):
         return self.norm(self.blocks[-1](tokens, pad, last=self.config.chunk_length))
 
 
-class _Head(nn.Module):
-    """MLPResNet of OpenVLA-OFT: LN-Linear-ReLU, pre-norm residual blocks, LN-Linear."""
-
-    def __init__(self, config: OFTConfig, out_bias: float, out_gain: float):
-        super().__init__()
-        self.norm_in = nn.LayerNorm(config.dim)
-        self.linear_in = nn.Linear(config.dim, config.head_dim)
-        self.blocks = nn.ModuleList(
-            nn.Sequential(nn.LayerNorm(config.head_dim), nn.Linear(config.head_dim, config.head_dim), nn.ReLU())
-            for _ in range(config.head_blocks)
-        )
-        self.norm_out = nn.LayerNorm(config.head_dim)
-        self.linear_out = nn.Linear(config.head_dim, ACTION_DIM)
-        nn.init.xavier_uniform_(self.linear_out.weight, gain=out_gain)
-        nn.init.constant_(self.linear_out.bias, out_bias)
-
-    def forward(self, x: Tensor) -> Tensor:
-        x = F.relu(self.linear_in(self.norm_in(x)))
-        for block in self.blocks:
-            x = x + block(x)
-        return self.linear_out(self.norm_out(x))
-
-
 class OFTPolicy(Policy, Pretrained):
     """Maps images, the proprioception and the instruction to the Laplace parameters of an action chunk.
 
@@ -282,8 +260,9 @@ class OFTPolicy(Policy, Pretrained):
         self.vocabulary = Vocabulary(config.vocabulary, config.max_words)
         self._longest = self.vocabulary.ids(config.instructions).shape[1]
         self.backbone = _Backbone(config)
-        self.loc_head = _Head(config, out_bias=0.0, out_gain=0.1)
-        self.scale_head = _Head(config, out_bias=config.log_scale_init, out_gain=0.01)
+        sizes = (config.dim, config.head_dim, ACTION_DIM, config.head_blocks)
+        self.loc_head = MLPResNet(*sizes, out_bias=0.0, out_gain=0.1)
+        self.scale_head = MLPResNet(*sizes, out_bias=config.log_scale_init, out_gain=0.01)
         self.register_buffer("state_center", torch.zeros(STATE_DIM))
         self.register_buffer("state_half_range", torch.ones(STATE_DIM))
         self.register_buffer("action_center", torch.zeros(ACTION_DIM))

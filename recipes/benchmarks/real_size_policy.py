@@ -1,0 +1,162 @@
+"""Rows of real_size.py: vision-language-action policies of the sizes that people post-train."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+from real_size_row import Row
+from tokenizers import Tokenizer, models, pre_tokenizers, processors
+from torch import Tensor, nn
+from transformers import LlavaConfig, PaliGemmaConfig, PretrainedConfig, SmolVLMConfig
+
+from worldenv_trl.keys import ACTION_DIM, STATE_DIM
+from worldenv_trl.policies.hf import HFConfig, HFPolicy
+
+CAMERAS = ("agentview", "wrist")
+INSTRUCTION = "put the wine bottle on top of the cabinet"
+IMAGE_SIZE = 256  # px, LIBERO's
+RANK = 32
+Inputs = tuple[dict[str, Tensor], Tensor, list[str]]
+
+
+def siglip_so400m(image_size: int) -> dict:
+    return {
+        "model_type": "siglip_vision_model",
+        "hidden_size": 1152,
+        "intermediate_size": 4304,
+        "num_hidden_layers": 27,
+        "num_attention_heads": 16,
+        "image_size": image_size,
+        "patch_size": 14,
+        "vision_use_head": False,
+    }
+
+
+def llava_7b() -> LlavaConfig:
+    """Llama-2-7B behind SigLIP-so400m at 224 px: OpenVLA-OFT's size, less its second eye (DINOv2-L, 0.3 B)."""
+    text = {
+        "model_type": "llama",
+        "hidden_size": 4096,
+        "intermediate_size": 11008,
+        "num_hidden_layers": 32,
+        "num_attention_heads": 32,
+        "vocab_size": 32064,
+    }
+    return LlavaConfig(
+        text_config=text,
+        vision_config=siglip_so400m(224),
+        vision_feature_layer=-2,
+        vision_feature_select_strategy="full",
+        image_token_index=32000,
+    )
+
+
+def paligemma_3b() -> PaliGemmaConfig:
+    """google/paligemma-3b-pt-224's sizes."""
+    text = {
+        "model_type": "gemma",
+        "hidden_size": 2048,
+        "intermediate_size": 16384,
+        "num_hidden_layers": 18,
+        "num_attention_heads": 8,
+        "num_key_value_heads": 1,
+        "head_dim": 256,
+        "vocab_size": 257216,
+    }
+    return PaliGemmaConfig(
+        text_config=text, vision_config=siglip_so400m(224), image_token_index=257152, projection_dim=2048
+    )
+
+
+def smolvlm_500m() -> SmolVLMConfig:
+    """HuggingFaceTB/SmolVLM-500M's sizes; 64 tokens an image of 512 px."""
+    text = {
+        "model_type": "llama",
+        "hidden_size": 960,
+        "intermediate_size": 2560,
+        "num_hidden_layers": 32,
+        "num_attention_heads": 15,
+        "num_key_value_heads": 5,
+        "head_dim": 64,
+        "vocab_size": 49280,
+    }
+    vision = {
+        "hidden_size": 768,
+        "intermediate_size": 3072,
+        "num_hidden_layers": 12,
+        "num_attention_heads": 12,
+        "image_size": 512,
+        "patch_size": 16,
+    }
+    return SmolVLMConfig(text_config=text, vision_config=vision, scale_factor=4, image_token_id=49190)
+
+
+def words() -> Tokenizer:
+    """One token a word: prompts come out about as long as with a real tokenizer."""
+    special = ["<s>", "<fake_token_around_image>", "<global-img>"]
+    known = [*special, *HFConfig.prompt.format(instruction=INSTRUCTION).replace(":", " : ").replace("?", " ? ").split()]
+    numbers = {word: number for number, word in enumerate(dict.fromkeys(["<unk>", *known]))}
+    tokenizer = Tokenizer(models.WordLevel(numbers, unk_token="<unk>"))
+    tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
+    tokenizer.add_special_tokens(special)
+    tokenizer.post_processor = processors.TemplateProcessing(single="<s> $A", special_tokens=[("<s>", numbers["<s>"])])
+    return tokenizer
+
+
+def make(backbone: PretrainedConfig) -> HFPolicy:
+    config = HFConfig(
+        backbone=backbone.to_dict(),
+        instructions=(INSTRUCTION,),
+        cameras=CAMERAS,
+        image_size=IMAGE_SIZE,
+        attention="full",
+        lora_rank=RANK,
+        dtype="bfloat16",
+        gradient_checkpointing=True,
+    )
+    return HFPolicy(config, words())
+
+
+def inputs(policy: HFPolicy, batch: int) -> Inputs:
+    device = policy.action_range.device
+    shape = (batch, 3, IMAGE_SIZE, IMAGE_SIZE)
+    images = {camera: torch.randint(0, 256, shape, dtype=torch.uint8, device=device) for camera in CAMERAS}
+    return images, torch.zeros(batch, STATE_DIM, device=device), [INSTRUCTION] * batch
+
+
+def decide(policy: HFPolicy, observed: Inputs) -> tuple[Tensor, Tensor]:
+    return policy.predict(*observed)
+
+
+def learning(policy: HFPolicy) -> list[nn.Parameter]:
+    return [parameter for group in policy.post_training_parameters(RANK).values() for parameter in group]
+
+
+def negative_log_likelihood(policy: HFPolicy, observed: Inputs) -> Tensor:
+    """Of a chunk of zeros: the forward and backward pass that LOOP and the scale head's training make."""
+    loc, log_scale = policy.predict(*observed)
+    return (loc.abs() / log_scale.exp() + log_scale).sum() / (loc.shape[0] * ACTION_DIM)
+
+
+def compile_layers(policy: HFPolicy) -> None:
+    """Layer by layer: equal layers share one graph."""
+    for module in policy.modules():
+        if type(module).__name__.endswith(("DecoderLayer", "EncoderLayer")):
+            module.compile(dynamic=False)
+
+
+def row(name: str, backbone: PretrainedConfig) -> Row:
+    return Row(
+        name=f"policy-{name}",
+        unit="decision",
+        make=partial(make, backbone),
+        inputs=inputs,
+        call=decide,
+        train=learning,
+        loss=negative_log_likelihood,
+        compile=compile_layers,
+    )
+
+
+ROWS = (row("llava-7b", llava_7b()), row("paligemma-3b", paligemma_3b()), row("smolvlm-500m", smolvlm_500m()))

@@ -1,0 +1,108 @@
+"""Reading folders of pretrained vision-language models: safetensors alone, and one clear line for what is missing."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+if TYPE_CHECKING:
+    from tokenizers import Tokenizer
+    from transformers import PreTrainedModel
+
+__all__ = ["check_weights", "read_backbone", "read_json", "read_tokenizer"]
+
+
+def read_backbone(
+    folder: str | os.PathLike, dtype: torch.dtype, device: str | torch.device
+) -> tuple[dict[str, Any], Tokenizer, PreTrainedModel]:
+    """What :meth:`HFPolicy.from_backbone` needs of a folder: fields of its config, tokenizer and backbone.
+
+    Raises:
+        FileNotFoundError: if a file is missing.
+        ValueError: if the weights are pickled, or the config is of no known family.
+    """
+    from transformers import AutoModelForImageTextToText
+
+    from worldenv_trl.policies.hf_backbone import backbone_config
+
+    folder = Path(folder)
+    config = backbone_config(read_json(folder, "config.json"))
+    check_weights(folder)
+    fields: dict[str, Any] = {"backbone": config.to_dict()}
+    if (folder / "preprocessor_config.json").exists():
+        images = read_json(folder, "preprocessor_config.json")
+        fields |= {name: tuple(images[name]) for name in ("image_mean", "image_std") if name in images}
+    tokenizer = read_tokenizer(folder)
+    with torch.device(device):
+        model = AutoModelForImageTextToText.from_pretrained(folder, dtype=dtype, local_files_only=True).model
+    return fields, tokenizer, model
+
+
+def read_json(folder: Path, name: str) -> dict[str, Any]:
+    """A JSON file of a checkpoint folder.
+
+    Raises:
+        FileNotFoundError: if it is missing.
+        ValueError: if it is no JSON object.
+    """
+    path = folder / name
+    if not path.is_file():
+        found = ", ".join(sorted(each.name for each in folder.iterdir())) if folder.is_dir() else "no such folder"
+        raise FileNotFoundError(f"{path} is missing, which a checkpoint folder must hold; there is: {found}")
+    try:
+        fields = json.loads(path.read_text())
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is no JSON ({error}): fetch it again") from error
+    if not isinstance(fields, dict):
+        raise ValueError(f"{path} must hold a JSON object, got {type(fields).__name__}: fetch it again")
+    return fields
+
+
+def read_tokenizer(folder: Path) -> Tokenizer:
+    """Of a folder's ``tokenizer.json``.
+
+    Raises:
+        FileNotFoundError: if it is missing; how to make it from older files is said.
+    """
+    from tokenizers import Tokenizer
+
+    path = folder / "tokenizer.json"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path} is missing: write it with transformers' "
+            f"AutoTokenizer.from_pretrained({str(folder)!r}).save_pretrained({str(folder)!r})"
+        )
+    return Tokenizer.from_file(str(path))
+
+
+def check_weights(folder: Path) -> list[Path]:
+    """The safetensors files of a folder.
+
+    Raises:
+        FileNotFoundError: if there are no weights.
+        ValueError: if they are pickled: reading them could run any code; the command that converts them is said.
+    """
+    found = sorted(folder.glob("*.safetensors"))
+    pickled = sorted(path.name for pattern in ("*.bin", "*.pt", "*.pth") for path in folder.glob(pattern))
+    if found:
+        return found
+    if pickled:
+        raise ValueError(
+            f"{folder} holds its weights as pickles alone ({pickled[0]}), which can run any code when read. If you "
+            "trust where they are from, convert them once: " + convert_command(folder / pickled[0])
+        )
+    raise FileNotFoundError(f"{folder} holds no weights: *.safetensors is missing")
+
+
+def convert_command(path: Path) -> str:
+    """The shell command that writes a pickled state dict as safetensors, reading nothing but tensors from it."""
+    target = path.with_suffix(".safetensors")
+    return (
+        f'python -c "import torch; from safetensors.torch import save_file; state = torch.load({str(path)!r}, '
+        f"weights_only=True, map_location='cpu'); save_file({{k: v.contiguous().clone() for k, v in state.items()}}, "
+        f'{str(target)!r})"'
+    )
