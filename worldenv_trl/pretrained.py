@@ -74,7 +74,7 @@ class Pretrained(_Module):
     def save_pretrained(self, folder: str | os.PathLike) -> Path:
         """Writes ``config.json``, ``model.safetensors`` and companions into ``folder`` and returns it.
 
-        The folder is made if it is missing. All files are complete on disk before any replaces an older one of the same name.
+        The folder is made if it is missing. All files are complete on disk before any replaces one of the same name.
         """
         folder = Path(folder)
         if folder.exists() and not folder.is_dir():

@@ -150,10 +150,10 @@ def _measure(row: Row, counted: Costs, device: torch.device, gpu: GPU | None, mo
     with torch.device(device):
         module = row.make()
     if mode == "compiled":
+        torch._dynamo.config.recompile_limit = 64  # a graph for each kind of layer, batch and mode, of a fixed shape
         row.compile(module)
     for work in counted.calls:
         _guarded(row, partial(_measure_call, row, module, work, counted.weight_bytes, device, gpu, mode))
-        free(device)
     if training:
         _guarded(row, partial(_measure_training, row, module, counted, device, gpu, mode))
 
@@ -185,7 +185,12 @@ def _share(seconds: float, flops: int, weight_bytes: int, gpu: GPU | None) -> st
 
 
 def _peak(device: torch.device) -> str:
-    return f", peak {_gb(torch.cuda.max_memory_allocated(device))}" if device.type == "cuda" else ""
+    """What was held at most since this was asked last."""
+    if device.type != "cuda":
+        return ""
+    peak = torch.cuda.max_memory_allocated(device)
+    torch.cuda.reset_peak_memory_stats(device)
+    return f", peak {_gb(peak)}"
 
 
 def _gb(size: float) -> str:

@@ -163,6 +163,7 @@ def measured_training(row: Row, module: nn.Module, repeats: int = 3) -> float:
 
 def free(device: torch.device) -> None:
     """Gives back what the last row held."""
+    torch.compiler.reset()
     gc.collect()
     if device.type == "cuda":
         torch.cuda.empty_cache()

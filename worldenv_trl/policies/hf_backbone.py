@@ -175,9 +175,11 @@ class VisionLanguageBackbone(nn.Module):
         """Of whole images alone: the model's own way asks tensors for their values, which blocks the device, and drops
         images that are blank."""
         vision = self.model.vision_model
-        patches = [side // vision.patch_size for side in pixels.shape[-2:]]
-        whole = torch.ones(pixels.shape[0], *patches, dtype=torch.bool, device=pixels.device)
-        embedded = vision.embeddings(pixel_values=pixels, patch_attention_mask=whole)
+        known, side = vision.embeddings.num_patches_per_side, pixels.shape[-1] // vision.patch_size
+        line = torch.arange(side, device=pixels.device) * known // side
+        where = (line[:, None] * known + line).flatten()
+        patches = vision.embeddings.patch_embedding(pixels).flatten(2).mT  # [n, P, width]
+        embedded = patches + vision.embeddings.position_embedding(where)
         return vision.post_layernorm(vision.encoder(inputs_embeds=embedded, attention_mask=None).last_hidden_state)
 
     def _mask(self, seen: Tensor, behind: int, dtype: torch.dtype) -> Any:
