@@ -6,6 +6,7 @@ from copy import deepcopy
 
 import pytest
 import torch
+from hf_models import hf_policy
 from observations import INSTRUCTIONS, TEXTS, observed, oft_policy
 from swaps.mlp_policy import MLPConfig, MLPPolicy
 from tensordict import TensorDict
@@ -23,7 +24,7 @@ def mlp_policy() -> MLPPolicy:
     return MLPPolicy(MLPConfig(instructions=INSTRUCTIONS))
 
 
-@pytest.fixture(params=[oft_policy, mlp_policy], ids=["oft", "mlp"])
+@pytest.fixture(params=[oft_policy, mlp_policy, hf_policy], ids=["oft", "mlp", "hf"])
 def policy(request):
     return request.param()
 

@@ -1,15 +1,19 @@
-"""Policies: the interface, the Laplace distribution and actor, the compact OFT policy, image augmentation."""
+"""Policies: the interface, the Laplace distribution and actor, the compact OFT policy, policies over
+Hugging Face vision-language models, image augmentation."""
 
 from worldenv_trl.policies.actor import LaplaceActor, laplace_actor, likelihood_actor, scale_bounds
 from worldenv_trl.policies.augmentation import random_shift
 from worldenv_trl.policies.base import Policy
 from worldenv_trl.policies.device_bridge import DeviceBridge
+from worldenv_trl.policies.hf import HFConfig, HFPolicy
 from worldenv_trl.policies.laplace import IndependentLaplace
 from worldenv_trl.policies.oft import OFTConfig, OFTPolicy
 from worldenv_trl.policies.pairing import check_pairing
 
 __all__ = [
     "DeviceBridge",
+    "HFConfig",
+    "HFPolicy",
     "IndependentLaplace",
     "LaplaceActor",
     "OFTConfig",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -88,6 +89,7 @@ class HFConfig:
     gradient_checkpointing: bool = False
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "backbone", json.loads(json.dumps(dict(self.backbone))))  # as it is read again
         kind = self.backbone.get("model_type")
         if kind not in FAMILIES:
             raise ValueError(f"the backbone's model_type must be one of {', '.join(FAMILIES)}, got {kind!r}")
@@ -108,7 +110,9 @@ class HFConfig:
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> Self:
         """Of a JSON object; the backbone's lists stay lists."""
-        plain = {name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()}
+        plain: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()
+        }
         return cls(**plain)
 
 
@@ -173,7 +177,10 @@ class HFPolicy(Policy, Pretrained):
         if config.lora_rank:
             self._inject_adapters()
         if config.gradient_checkpointing:
-            model.gradient_checkpointing_enable({"use_reentrant": False})
+            # Its older name is deprecated since transformers 5.23.
+            enable = getattr(model, "activation_checkpointing_enable", None) or model.gradient_checkpointing_enable
+            enable({"use_reentrant": False})
+            model.disable_input_require_grads()  # for reentrant checkpoints alone
 
     @classmethod
     def from_backbone(cls, folder: str | os.PathLike, *, device: str | torch.device = "cpu", **settings: Any) -> Self:
@@ -328,6 +335,7 @@ class HFPolicy(Policy, Pretrained):
 @functools.lru_cache(maxsize=64)
 def _padded(rows: tuple[tuple[int, ...], ...], at_least: int) -> tuple[Tensor, Tensor]:
     length = max([at_least, *map(len, rows)])
-    ids = torch.tensor([[*row, *[0] * (length - len(row))] for row in rows], device="cpu")
-    valid = torch.tensor([[True] * len(row) + [False] * (length - len(row)) for row in rows], device="cpu")
+    # In front, so that the prompt's last token stands before the placeholders in every row.
+    ids = torch.tensor([[*[0] * (length - len(row)), *row] for row in rows], device="cpu")
+    valid = torch.tensor([[False] * (length - len(row)) + [True] * len(row) for row in rows], device="cpu")
     return ids, valid

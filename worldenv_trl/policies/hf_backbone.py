@@ -109,7 +109,7 @@ class VisionLanguageBackbone(nn.Module):
         self._kinds = set(getattr(text, "layer_types", None) or ())
 
     @property
-    def language_model(self) -> nn.Module:
+    def language_model(self) -> PreTrainedModel:
         return getattr(self.model, "language_model", None) or self.model.text_model
 
     def forward(self, pixels: Tensor, proprio: Tensor, ids: Tensor, valid: Tensor, placeholders: int) -> Tensor:
@@ -118,7 +118,7 @@ class VisionLanguageBackbone(nn.Module):
         Args:
             pixels: prepared images of every camera, [n, cameras, 3, H, W].
             proprio: its token, [n, dim].
-            ids: of the text behind its first special token, int64 [n, L], padded anywhere.
+            ids: of the text behind its first special token, int64 [n, L], padded in front.
             valid: which of them are no padding, bool [n, L].
             placeholders: how many.
         """
