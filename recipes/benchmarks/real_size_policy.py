@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 
 import torch
@@ -12,6 +13,7 @@ from transformers import LlavaConfig, PaliGemmaConfig, PretrainedConfig, SmolVLM
 
 from worldenv_trl.keys import ACTION_DIM, STATE_DIM
 from worldenv_trl.policies.hf import HFConfig, HFPolicy
+from worldenv_trl.policies.prismatic import PrismaticConfig, dinosiglip_towers
 
 CAMERAS = ("agentview", "wrist")
 INSTRUCTION = "put the wine bottle on top of the cabinet"
@@ -33,18 +35,26 @@ def siglip_so400m(image_size: int) -> dict:
     }
 
 
+LLAMA_2_7B = {
+    "model_type": "llama",
+    "hidden_size": 4096,
+    "intermediate_size": 11008,
+    "num_hidden_layers": 32,
+    "num_attention_heads": 32,
+    "vocab_size": 32064,
+}
+
+
+def openvla_oft_7b() -> PrismaticConfig:
+    """OpenVLA-OFT: Llama-2-7B behind DINOv2-L and SigLIP-so400m at 224 px."""
+    towers = [dataclasses.asdict(tower) for tower in dinosiglip_towers()]
+    return PrismaticConfig(LLAMA_2_7B, {"image_size": 224, "towers": towers})
+
+
 def llava_7b() -> LlavaConfig:
-    """Llama-2-7B behind SigLIP-so400m at 224 px: OpenVLA-OFT's size, less its second eye (DINOv2-L, 0.3 B)."""
-    text = {
-        "model_type": "llama",
-        "hidden_size": 4096,
-        "intermediate_size": 11008,
-        "num_hidden_layers": 32,
-        "num_attention_heads": 32,
-        "vocab_size": 32064,
-    }
+    """LLaVA's layout with the same language model, and SigLIP-so400m alone."""
     return LlavaConfig(
-        text_config=text,
+        text_config=LLAMA_2_7B,
         vision_config=siglip_so400m(224),
         vision_feature_layer=-2,
         vision_feature_select_strategy="full",
@@ -104,7 +114,7 @@ def words() -> Tokenizer:
     return tokenizer
 
 
-def make(backbone: PretrainedConfig) -> HFPolicy:
+def make(backbone: PretrainedConfig | PrismaticConfig) -> HFPolicy:
     config = HFConfig(
         backbone=backbone.to_dict(),
         instructions=(INSTRUCTION,),
@@ -146,7 +156,7 @@ def compile_layers(policy: HFPolicy) -> None:
             module.compile(dynamic=False)
 
 
-def row(name: str, backbone: PretrainedConfig) -> Row:
+def row(name: str, backbone: PretrainedConfig | PrismaticConfig) -> Row:
     return Row(
         name=f"policy-{name}",
         unit="decision",
@@ -159,4 +169,9 @@ def row(name: str, backbone: PretrainedConfig) -> Row:
     )
 
 
-ROWS = (row("llava-7b", llava_7b()), row("paligemma-3b", paligemma_3b()), row("smolvlm-500m", smolvlm_500m()))
+ROWS = (
+    row("openvla-oft-7b", openvla_oft_7b()),
+    row("llava-7b", llava_7b()),
+    row("paligemma-3b", paligemma_3b()),
+    row("smolvlm-500m", smolvlm_500m()),
+)

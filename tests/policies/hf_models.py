@@ -22,6 +22,7 @@ from transformers import (
 )
 
 from worldenv_trl.policies import HFConfig, HFPolicy
+from worldenv_trl.policies.prismatic import PrismaticConfig
 
 RESOLUTION = 28
 SPECIAL = ["<s>", "<image>", "<fake_token_around_image>", "<global-img>", "<|vision_start|>", "<|vision_end|>"]
@@ -92,10 +93,21 @@ FAMILIES = {
         },
         image_token_id=IMAGE_ID,
     ),
+    "prismatic": lambda: PrismaticConfig(
+        {"model_type": "llama", **TEXT},
+        {
+            "image_size": RESOLUTION,
+            "towers": [
+                {"dim": 16, "depth": 2, "num_heads": 2, "mlp_dim": 24, "patch_size": 7, "class_token": True}
+                | {"registers": 2, "layer_scale": True},
+                {"dim": 24, "depth": 2, "num_heads": 2, "mlp_dim": 32, "patch_size": 7},
+            ],
+        },
+    ),
 }
 
 
-def backbone(family: str) -> PretrainedConfig:
+def backbone(family: str) -> PretrainedConfig | PrismaticConfig:
     return FAMILIES[family]()
 
 

@@ -40,7 +40,7 @@ def hidden_states(network: VisionLanguageBackbone, *inputs) -> tuple[Tensor, dic
     return kept.pop("out"), kept
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", [family for family in FAMILIES if family != "prismatic"])
 @torch.no_grad()
 def test_images_and_text_are_seen_as_the_model_itself_sees_them(family):
     """The model's own forward, on ids in its processor's order; a token's embedding stands in for proprioception."""

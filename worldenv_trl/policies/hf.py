@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 __all__ = ["HFConfig", "HFPolicy"]
 
 TOKENIZER_NAME = "tokenizer.json"
+FINGER_TRAVEL = 0.04  # metres, of each of the Panda's fingers in LIBERO, from closed to open
 PROMPT = "In: What action should the robot take to {instruction}?\nOut:"
 
 
@@ -55,6 +56,11 @@ class HFConfig:
         image_mean, image_std: of each channel, as the backbone was pretrained.
         prompt: with ``{instruction}``, which is put in lower case.
         attention: ``prefix`` or ``full``; see :class:`~worldenv_trl.policies.hf_backbone.VisionLanguageBackbone`.
+        stop_id: of a token behind the placeholders; none when -1.
+        readout_shift: how many tokens before the placeholders the first hidden state is read (OpenVLA-OFT: 1).
+        prompt_end: ids of tokens behind every prompt.
+        proprio_format: of the proprioception that the backbone sees, ``state``, the env's 7 numbers, or ``libero``, 8
+            numbers: the gripper's opening becomes the positions of LIBERO's two fingers (m).
         head_dim: width of both heads; that of the language model when 0.
         head_blocks: residual blocks of both heads.
         log_scale_init: the log-scale before training.
@@ -80,6 +86,10 @@ class HFConfig:
     image_std: tuple[float, ...] = (0.5, 0.5, 0.5)
     prompt: str = PROMPT
     attention: str = "full"
+    stop_id: int = -1
+    readout_shift: int = 0
+    prompt_end: tuple[int, ...] = ()
+    proprio_format: str = "state"
     head_dim: int = 0
     head_blocks: int = 2
     log_scale_init: float = -3.0
@@ -100,6 +110,8 @@ class HFConfig:
             object.__setattr__(self, "resolution", int(side))
         if self.attention not in ("prefix", "full"):
             raise ValueError(f"attention must be 'prefix' or 'full', got {self.attention!r}")
+        if self.proprio_format not in ("state", "libero"):
+            raise ValueError(f"proprio_format must be 'state' or 'libero', got {self.proprio_format!r}")
         if self.dtype not in ("float32", "bfloat16"):
             raise ValueError(f"dtype must be 'float32' or 'bfloat16', got {self.dtype!r}")
         if "{instruction}" not in self.prompt:
@@ -162,14 +174,17 @@ class HFPolicy(Policy, Pretrained):
             token_ids=(around[0], around[1]),
             first_id=first[0] if first else None,
             attention=config.attention,
+            stop_id=config.stop_id if config.stop_id >= 0 else None,
+            readout_shift=config.readout_shift,
         )
         dim = self.backbone.dim
-        self.proprio_projector = nn.Sequential(nn.Linear(STATE_DIM, dim), nn.GELU(), nn.Linear(dim, dim))
+        proprio_dim = STATE_DIM + (config.proprio_format == "libero")
+        self.proprio_projector = nn.Sequential(nn.Linear(proprio_dim, dim), nn.GELU(), nn.Linear(dim, dim))
         sizes = (ACTION_DIM * dim, config.head_dim or dim, ACTION_DIM, config.head_blocks)
         self.loc_head = MLPResNet(*sizes, out_bias=0.0, out_gain=0.1)
         self.scale_head = MLPResNet(*sizes, out_bias=config.log_scale_init, out_gain=0.01)
-        self.register_buffer("state_low", -torch.ones(STATE_DIM))
-        self.register_buffer("state_high", torch.ones(STATE_DIM))
+        self.register_buffer("state_low", -torch.ones(proprio_dim))
+        self.register_buffer("state_high", torch.ones(proprio_dim))
         self.register_buffer("action_center", torch.zeros(ACTION_DIM))
         self.register_buffer("action_gain", torch.ones(ACTION_DIM))
         self._prompts: dict[str, list[int]] = {}
@@ -178,9 +193,9 @@ class HFPolicy(Policy, Pretrained):
             self._inject_adapters()
         if config.gradient_checkpointing:
             # Its older name is deprecated since transformers 5.23.
-            enable = getattr(model, "activation_checkpointing_enable", None) or model.gradient_checkpointing_enable
+            enable: Any = getattr(model, "activation_checkpointing_enable", None) or model.gradient_checkpointing_enable
             enable({"use_reentrant": False})
-            model.disable_input_require_grads()  # for reentrant checkpoints alone
+            self.backbone.model.disable_input_require_grads()  # for reentrant checkpoints alone
 
     @classmethod
     def from_backbone(cls, folder: str | os.PathLike, *, device: str | torch.device = "cpu", **settings: Any) -> Self:
@@ -219,7 +234,7 @@ class HFPolicy(Policy, Pretrained):
         )
         ids, valid = self._prompt_tensors(instructions)
         span = self.state_high - self.state_low
-        proprio = (2 * (state - self.state_low) / (span + 1e-8) - 1).clamp(-1, 1)
+        proprio = (2 * (self._proprio(state) - self.state_low) / (span + 1e-8) - 1).clamp(-1, 1)
         with autocast(state.device, self._dtype):
             hidden = self.backbone(
                 pixels, self.proprio_projector(proprio), ids, valid, self.chunk_length * ACTION_DIM
@@ -238,7 +253,7 @@ class HFPolicy(Policy, Pretrained):
             ValueError: for no data, or numbers that are not finite.
         """
         bounds = []
-        for name, values, floor in (("states", states, 0.05), ("actions", actions, 0.005)):
+        for name, values, floor in (("states", self._proprio(states), 0.05), ("actions", actions, 0.005)):
             flat = values.reshape(-1, values.shape[-1]).float()
             if flat.shape[0] == 0 or not torch.isfinite(flat).all():
                 raise ValueError(f"{name} must hold at least one row and only finite numbers")
@@ -250,6 +265,12 @@ class HFPolicy(Policy, Pretrained):
         self.action_center.copy_(action_center)
         self.action_gain.copy_(action_half)
         self.action_range.copy_(action_half)
+
+    def _proprio(self, state: Tensor) -> Tensor:
+        if self.config.proprio_format == "state":
+            return state
+        finger = FINGER_TRAVEL * state[..., -1:]
+        return torch.cat([state[..., :-1], finger, -finger], -1)
 
     def scale_parameters(self) -> list[nn.Parameter]:
         return list(self.scale_head.parameters())
@@ -321,7 +342,10 @@ class HFPolicy(Policy, Pretrained):
     def _prompt_ids(self, instruction: str) -> list[int]:
         if instruction not in self._prompts:
             text = self.config.prompt.replace("{instruction}", instruction.lower())
-            self._prompts[instruction] = self.tokenizer.encode(text, add_special_tokens=False).ids
+            self._prompts[instruction] = [
+                *self.tokenizer.encode(text, add_special_tokens=False).ids,
+                *self.config.prompt_end,
+            ]
         return self._prompts[instruction]
 
     @torch.compiler.disable  # see Policy._goals

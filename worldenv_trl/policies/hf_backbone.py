@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from worldenv_trl.policies.prismatic import PrismaticConfig, PrismaticModel
+
 if TYPE_CHECKING:
     from transformers import PreTrainedConfig, PreTrainedModel
 
@@ -45,12 +47,13 @@ FAMILIES: Mapping[str, Family] = {
     "smolvlm": _IDEFICS,
     "qwen2_vl": _QWEN,
     "qwen2_5_vl": _QWEN,
+    "prismatic": Family(),
 }
 """By the ``model_type`` of their config."""
 
 
-def backbone_config(fields: Mapping[str, Any]) -> PreTrainedConfig:
-    """The transformers config of what its ``to_dict()`` gave.
+def backbone_config(fields: Mapping[str, Any]) -> PreTrainedConfig | PrismaticConfig:
+    """The config of what its ``to_dict()`` gave: transformers', or this package's own of OpenVLA's backbone.
 
     Raises:
         ValueError: for a family that is not in :data:`FAMILIES`.
@@ -61,13 +64,17 @@ def backbone_config(fields: Mapping[str, Any]) -> PreTrainedConfig:
     kind = fields.pop("model_type", None)
     if kind not in FAMILIES:
         raise ValueError(f"the backbone's model_type must be one of {', '.join(FAMILIES)}, got {kind!r}")
+    if kind == PrismaticConfig.model_type:
+        return PrismaticConfig(fields["text_config"], fields["vision_config"])
     return AutoConfig.for_model(kind, **fields)
 
 
-def make_model(config: PreTrainedConfig, dtype: torch.dtype) -> PreTrainedModel:
+def make_model(config: PreTrainedConfig | PrismaticConfig, dtype: torch.dtype) -> PreTrainedModel | PrismaticModel:
     """The model of a config without its language-modelling head, with random weights, on torch's default device."""
     from transformers import AutoModelForImageTextToText
 
+    if isinstance(config, PrismaticConfig):
+        return PrismaticModel(config, dtype)
     return AutoModelForImageTextToText.from_config(config, dtype=dtype).model
 
 
@@ -88,9 +95,11 @@ class VisionLanguageBackbone(nn.Module):
         readout_shift: how many tokens before the placeholders the first hidden state is read (OpenVLA-OFT: 1).
     """
 
+    model: Any  # transformers has no types
+
     def __init__(
         self,
-        model: PreTrainedModel,
+        model: PreTrainedModel | PrismaticModel,
         *,
         token_ids: tuple[Sequence[int], Sequence[int]] = ((), ()),
         first_id: int | None = None,
@@ -109,7 +118,7 @@ class VisionLanguageBackbone(nn.Module):
         self._kinds = set(getattr(text, "layer_types", None) or ())
 
     @property
-    def language_model(self) -> PreTrainedModel:
+    def language_model(self) -> Any:
         return getattr(self.model, "language_model", None) or self.model.text_model
 
     def forward(self, pixels: Tensor, proprio: Tensor, ids: Tensor, valid: Tensor, placeholders: int) -> Tensor:
@@ -160,7 +169,7 @@ class VisionLanguageBackbone(nn.Module):
     def image_features(self, pixels: Tensor) -> Tensor:
         """What the language model sees of prepared images [n, 3, H, W]: [n, T, dim]."""
         model, kind = self.model, self.model.config.model_type
-        pixels = pixels.to(model.dtype)
+        pixels = pixels if kind == "prismatic" else pixels.to(model.dtype)  # that one normalises first
         if kind in ("idefics3", "smolvlm"):
             return model.connector(self._idefics_vision(pixels))
         if self.family.grid_positions:
