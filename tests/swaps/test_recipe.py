@@ -26,6 +26,20 @@ def copying(config) -> CopyingWorldModel:
     return CopyingWorldModel(CopyingConfig(**seen))
 
 
+def vision_language(config) -> HFPolicy:
+    network = hf_models.backbone("smolvlm").to_dict()
+    seen = {"image_size": config.image_size, "chunk_length": config.chunk_length, "cameras": config.cameras}
+    settings = HFConfig(
+        backbone=network,
+        instructions=instructions(config),
+        lora_rank=config.post_train.lora_rank,
+        dtype="bfloat16",
+        gradient_checkpointing=True,
+        **seen,
+    )
+    return HFPolicy(settings, hf_models.tokenizer())
+
+
 OTHERS = {
     "policy": Part(mlp, MLPPolicy.from_pretrained),
     "world_model": Part(copying, CopyingWorldModel.from_pretrained),

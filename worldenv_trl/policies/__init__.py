@@ -8,6 +8,7 @@ from worldenv_trl.policies.device_bridge import DeviceBridge
 from worldenv_trl.policies.hf import HFConfig, HFPolicy
 from worldenv_trl.policies.laplace import IndependentLaplace
 from worldenv_trl.policies.oft import OFTConfig, OFTPolicy
+from worldenv_trl.policies.openvla_oft import load_openvla_oft
 from worldenv_trl.policies.pairing import check_pairing
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "check_pairing",
     "laplace_actor",
     "likelihood_actor",
+    "load_openvla_oft",
     "random_shift",
     "scale_bounds",
 ]

@@ -83,10 +83,16 @@ def check_weights(folder: Path) -> list[Path]:
     """The safetensors files of a folder.
 
     Raises:
-        FileNotFoundError: if there are no weights.
+        FileNotFoundError: if there are no weights, or a file is missing that their index lists.
         ValueError: if they are pickled: reading them could run any code; the command that converts them is said.
     """
     found = sorted(folder.glob("*.safetensors"))
+    index = folder / "model.safetensors.index.json"
+    if index.is_file():
+        listed = sorted(set(read_json(folder, index.name).get("weight_map", {}).values()))
+        missing = [name for name in listed if not (folder / name).is_file()]
+        if missing:
+            raise FileNotFoundError(f"{folder} lacks {', '.join(missing)}, which {index.name} lists: fetch them again")
     pickled = sorted(path.name for pattern in ("*.bin", "*.pt", "*.pth") for path in folder.glob(pattern))
     if found:
         return found

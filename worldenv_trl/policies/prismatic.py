@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -203,7 +204,7 @@ class PrismaticModel(nn.Module):
         enable(dict(settings))
         towers: list[Any] = list(self.towers)
         for tower in towers:
-            tower.checkpoint = lambda block, x: checkpoint(block, x, **settings)
+            tower.checkpoint = partial(checkpoint, **settings)
 
     def disable_input_require_grads(self) -> None:
         self.language_model.disable_input_require_grads()
