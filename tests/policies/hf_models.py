@@ -6,7 +6,7 @@ import functools
 
 import pytest
 import torch
-from observations import INSTRUCTIONS
+from policies.observations import INSTRUCTIONS
 
 pytest.importorskip("transformers")
 

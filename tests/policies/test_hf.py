@@ -11,9 +11,10 @@ import torch
 from hf_models import FAMILIES, RESOLUTION, backbone, hf_policy, tokenizer
 from observations import INSTRUCTIONS, observed
 from torch import Tensor
+from torchrl.objectives import BCLoss
 
 from worldenv_trl import keys
-from worldenv_trl.policies import HFConfig, HFPolicy
+from worldenv_trl.policies import HFConfig, HFPolicy, laplace_actor
 
 transformers = pytest.importorskip("transformers")
 
@@ -118,11 +119,21 @@ def test_proprioception_beyond_the_bounds_is_clipped_to_them():
     assert torch.equal(policy(far)[keys.LOC], policy(edge)[keys.LOC])
 
 
-def test_checkpointing_gives_the_same_gradients():
-    kept, again = hf_policy(), hf_policy(gradient_checkpointing=True)
+def cloning_loss(policy: HFPolicy) -> Tensor:
+    """Functional: the parameters are in the module while it runs forward, and only then."""
+    loss = BCLoss(laplace_actor(policy), loss_function="l1")
+    loss.set_keys(action=keys.CHUNK)
+    return loss(observed().set(keys.CHUNK, torch.full((6, 8, 7), 0.5)))["loss_bc"]
+
+
+@pytest.mark.filterwarnings("ignore:The name target_actor_network_params")
+@pytest.mark.parametrize("objective", [loss_of, cloning_loss])
+@pytest.mark.parametrize("family", ["smolvlm", "prismatic"])
+def test_checkpointing_gives_the_same_gradients(family, objective):
+    kept, again = hf_policy(family), hf_policy(family, gradient_checkpointing=True)
     for policy in (kept, again):
         stir(policy)
-        loss_of(policy).backward()
+        objective(policy).backward()
     for (name, first), (_, second) in zip(kept.named_parameters(), again.named_parameters(), strict=True):
         assert (first.grad is None) == (second.grad is None), name
         if first.grad is not None:

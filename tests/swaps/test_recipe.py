@@ -5,14 +5,17 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
+import torch
 from colour_reflector import ColourConfig, ColourReflector
 from copying_world_model import CopyingConfig, CopyingWorldModel
 from mlp_policy import MLPConfig, MLPPolicy
+from policies import hf_models
 
 from parts import COMPACT, Part, instructions
 from run_folder import RunFolder
 from stages import plan
 from world_env import run_all
+from worldenv_trl.policies import HFConfig, HFPolicy
 from worldenv_trl.record import read_metadata
 
 
@@ -49,6 +52,9 @@ OTHERS = {
 }
 
 
+VISION_LANGUAGE = Part(vision_language, HFPolicy.from_pretrained)
+
+
 @pytest.fixture(autouse=True)
 def forgiving_expert(monkeypatch):
     monkeypatch.setattr("demonstrate.check_solved", lambda *_: None)  # 16 steps are too few for the expert
@@ -77,3 +83,14 @@ def test_the_compact_parts_learn_through_two_cameras(tiny, capsys):
     assert "missing in the report" not in capsys.readouterr().out
     lines = RunFolder(config.run_dir).read_metrics("world_model")
     assert any("psnr_model_1_wrist" in line for line in lines)
+
+
+def test_a_vision_language_model_is_fine_tuned_and_post_trained_by_the_same_recipe(tiny, capsys):
+    config = dataclasses.replace(tiny, cameras=("agentview", "wrist"))
+    run_all(config, dataclasses.replace(COMPACT, policy=VISION_LANGUAGE))
+    folder = RunFolder(config.run_dir)
+    assert all(folder.done(stage.name) for stage in plan(config))
+    assert "missing in the report" not in capsys.readouterr().out
+    before, after = (HFPolicy.from_pretrained(folder.checkpoint(name)).state_dict() for name in ("sft", "post_train"))
+    changed = {name for name, tensor in after.items() if not torch.equal(tensor, before[name])}
+    assert changed and all("lora_" in name or "head" in name or "proprio" in name for name in changed)
