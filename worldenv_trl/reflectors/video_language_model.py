@@ -87,8 +87,8 @@ class VideoLanguageModel(nn.Module):
             pickled = sorted(path.name for path in folder.glob("*.bin"))
             if pickled:
                 raise ValueError(
-                    f"{folder} holds its weights as a pickle, {pickled[0]}, which may run code when it is read: convert it "
-                    "where you trust it, AutoModelForImageTextToText.from_pretrained(folder).save_pretrained(new_folder)"
+                    f"{folder} holds its weights as a pickle, {pickled[0]}, which may run code when read: convert "
+                    "it where you trust it, AutoModelForImageTextToText.from_pretrained(folder).save_pretrained(new)"
                 )
             raise FileNotFoundError(f"no *.safetensors in {folder}: copy the weights there")
         model_type = json.loads((folder / "config.json").read_text()).get("model_type")
