@@ -32,7 +32,7 @@ from worldenv_trl.devices import choose_device
 
 Result = TypeVar("Result")
 
-FAMILIES = {"policy": "real_size_policy"}
+FAMILIES = {"policy": "real_size_policy", "models": "real_size_models"}
 """By the name of the part: the module beside this one whose ``ROWS`` are its rows."""
 
 

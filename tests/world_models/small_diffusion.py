@@ -1,4 +1,4 @@
-"""Diffusion world models of random weights, small enough for a test, with one camera in the world and one on the hand."""
+"""Diffusion world models of random weights, small enough for a test, and what they are asked."""
 
 from __future__ import annotations
 

@@ -60,6 +60,12 @@ class VideoLanguageModel(nn.Module):
         self.tokens_per_frame, self.width = side * side, int(config.text_config.hidden_size)
         self.video_token = int(config.video_token_id)
         self._colours = (tuple(mean), tuple(std))
+        # Causal attention does not look at what is padded behind: no mask, and the fastest kernel serves. Qwen2, told
+        # so for its layers, does not look for packed sequences either, for which a GPU would have to be waited for.
+        text = model.get_submodule("model.language_model").config
+        plain = text.model_type == "qwen2" and set(text.layer_types) == {"full_attention"}
+        fused = text._attn_implementation in ("sdpa", "flash_attention_2")
+        self._mask = {"full_attention": None} if plain and fused else None
         self._prompts: dict[str, tuple[list[int], list[int]]] = {}
 
     @classmethod
@@ -178,9 +184,10 @@ class VideoLanguageModel(nn.Module):
         for video, (before, after) in zip(videos, prompts, strict=True):
             first, last = (embed(torch.tensor(ids, dtype=torch.int64, device=device)) for ids in (before, after))
             rows.append(torch.cat([first, video.flatten(0, 1).to(first.dtype), newline.to(first.dtype), last]))
-        # Causal attention does not look at what is padded behind: no mask, so the fastest kernel serves.
         padded = nn.utils.rnn.pad_sequence(rows, batch_first=True)
-        states = self.net.model.language_model(inputs_embeds=padded, use_cache=False).last_hidden_state
+        states = self.net.model.language_model(
+            inputs_embeds=padded, attention_mask=self._mask, use_cache=False
+        ).last_hidden_state
         return [states[index, : len(row)] for index, row in enumerate(rows)]
 
     def logits(self, states: Tensor, words: Sequence[int]) -> Tensor:

@@ -1,4 +1,4 @@
-"""What the full-size world model is told beside remembered frames: action maps, rays, and tokens of image and actions."""
+"""What the full-size world model is told beside remembered frames: action maps, rays, tokens of image and actions."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ class ViewGeometry(nn.Module):
 class ContextTokens(nn.Module):
     """What each frame cross-attends to: tokens of what is seen now, and of the chunk's actions.
 
-    A frozen vision tower (CLIP or SigLIP) looks at the newest frame of each camera; a resampler of learned queries, some
-    for each frame, reads its tokens (IP-Adapter's, EVAC's), another one the actions.
+    A frozen vision tower (CLIP or SigLIP) looks at the newest frame of each camera; a resampler of learned queries,
+    some for each frame, reads its tokens (IP-Adapter's, EVAC's), another one the actions.
     """
 
     def __init__(self, config: DiffusionWorldModelConfig) -> None:

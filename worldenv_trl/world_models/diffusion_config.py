@@ -88,7 +88,7 @@ class DiffusionWorldModelConfig:
     frames_per_call: int = 16
     """Frames that pass through the VAE at once."""
     gradient_checkpointing: bool = False
-    """In training, activations of the UNet's blocks are computed twice instead of kept."""
+    """In training, activations of the UNet's blocks are computed twice instead of being kept."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "frame_size", tuple(int(side) for side in self.frame_size))
@@ -166,8 +166,8 @@ class DiffusionWorldModelConfig:
                 found[part] = {key: value for key, value in known.items() if not key.startswith("_")}
         if not found:
             raise FileNotFoundError(
-                f"no vae, unet or image_encoder in {folder}: name a folder in the layout of diffusers, such as one that "
-                "DiffusionPipeline.save_pretrained wrote"
+                f"no vae, unet or image_encoder in {folder}: name a folder in the layout of diffusers, such as "
+                "one that DiffusionPipeline.save_pretrained wrote"
             )
         return found
 

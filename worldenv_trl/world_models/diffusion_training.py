@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -16,9 +17,9 @@ from worldenv_trl.world_models.diffusion_process import TRAIN_STEPS
 from worldenv_trl.world_models.window import Window
 
 if TYPE_CHECKING:
-    from worldenv_trl.world_models.diffusion_world_model import DiffusionWorldModel
+    from worldenv_trl.world_models.diffusion_world_model import Conditions, DiffusionWorldModel
 
-__all__ = ["diffusion_loss"]
+__all__ = ["denoising_loss", "diffusion_loss"]
 
 
 def diffusion_loss(model: DiffusionWorldModel, windows: TensorDictBase) -> TensorDict:
@@ -47,20 +48,32 @@ def diffusion_loss(model: DiffusionWorldModel, windows: TensorDictBase) -> Tenso
     asked = request(model, window.recall, now, targets[POSES], window.actions[:, steps], texts)
     clean = torch.cat([model.encode(to_float(targets[frames_key(camera)])) for camera in model.cameras], -2)
 
-    conditions, disturbed = model.conditions(asked, texts), torch.rand(len(windows), device=device)
-    disturbed = disturbed * model.config.memory_noise
+    return denoising_loss(model, clean, model.conditions(asked, texts), window.mask[:, steps])
+
+
+def denoising_loss(model: DiffusionWorldModel, clean: Tensor, conditions: Conditions, valid: Tensor) -> TensorDict:
+    """The same of a chunk's latents.
+
+    Args:
+        model: its network is trained.
+        clean: [B, C, z, h, w].
+        conditions: of the chunk.
+        valid: bool [B, C], frames that count.
+    """
+    count, device = len(clean), clean.device
+    disturbed = torch.rand(count, device=device) * model.config.memory_noise
     memory = conditions.memory + disturbed.view(-1, 1, 1, 1, 1) * torch.randn_like(conditions.memory)
-    conditions = type(conditions)(memory, conditions.fixed, conditions.context)
-    noise, timesteps = torch.randn_like(clean), torch.randint(TRAIN_STEPS, (len(windows),), device=device)
+    conditions = replace(conditions, memory=memory)
+    noise, timesteps = torch.randn_like(clean), torch.randint(TRAIN_STEPS, (count,), device=device)
     noisy = model.scheduler.add_noise(clean, noise, timesteps)
     predicted = model.predict_v(noisy, timesteps, conditions, disturbed)
     wanted = model.scheduler.get_velocity(clean, noise, timesteps)
 
-    valid = window.mask[:, steps].float()
-    total = valid.sum().clamp(min=1)
+    weight = valid.float()
+    total = weight.sum().clamp(min=1)
 
     def mean(square: Tensor) -> Tensor:
-        return (square.mean((-3, -2, -1)) * valid).sum() / total
+        return (square.mean((-3, -2, -1)) * weight).sum() / total
 
     square = (predicted - wanted).square()
     # x_0 = sqrt(a) x - sqrt(1 - a) v: an error of v is one of x_0, times the level of noise.

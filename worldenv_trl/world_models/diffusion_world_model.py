@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
@@ -37,12 +38,12 @@ _ADDED_IDS = 3  # frames per second, gap between frames, noise of the memory: as
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the UNet knows beside the noisy chunk, computed once for all steps; h is the height of all views, stacked."""
+    """What the UNet knows beside the noisy chunk, computed once for all steps; h is the height of all views."""
 
     memory: Tensor
     """Latents [B, M, z, h, w] of the remembered frames."""
     fixed: Tensor
-    """[B, M + C, z + 1 + z + 6, h, w]: the newest frame's latents, the memory's mask, the action map's latents, rays."""
+    """[B, M + C, z + 1 + z + 6, h, w]: latents of the newest frame, the memory's mask, latents of action maps, rays."""
     context: Tensor
     """[B, M + C, L, D]."""
 
@@ -101,7 +102,10 @@ class DiffusionWorldModel(WorldModel, Pretrained):
         }
         self.unet: Any = VideoUNet.from_config(config.unet | sizes)
         if config.gradient_checkpointing:
-            self.unet.enable_gradient_checkpointing()
+            self.unet.checkpoint_activations()
+        for module in self.modules():  # the layout of a GPU's convolutions
+            if isinstance(module, nn.Conv2d):
+                module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.context = ContextTokens(config)
         self.scheduler = make_scheduler()
 
@@ -115,7 +119,7 @@ class DiffusionWorldModel(WorldModel, Pretrained):
     def weights_to(self, dtype: torch.dtype) -> DiffusionWorldModel:
         """Holds the networks' weights in ``dtype``; geometry stays in float32."""
         for network in (self.vae, self.unet, self.context):
-            network.to(dtype)
+            nn.Module.to(network, dtype)  # diffusers' own warns, whatever is in it
         return self
 
     def memory_indices(self, now: Tensor) -> Tensor:
@@ -233,11 +237,13 @@ class DiffusionWorldModel(WorldModel, Pretrained):
     def _in_parts(self, work: Callable[[Tensor], Tensor], images: Tensor) -> Tensor:
         return torch.cat([work(part) for part in images.split(self.config.frames_per_call)])
 
-    def _precision(self, device: torch.device) -> torch.autocast:
+    def _precision(self, device: torch.device) -> AbstractContextManager:
         wanted = self.config.precision
         low = wanted == "bfloat16" or (wanted == "auto" and device.type == "cuda")
         # Weights that are bfloat16 already need nobody to cast them.
-        return torch.autocast(device.type, torch.bfloat16, enabled=low and self.unet.dtype == torch.float32)
+        if low and self.unet.dtype == torch.float32:
+            return torch.autocast(device.type, torch.bfloat16)
+        return nullcontext()
 
     def _check(self, tensordict: TensorDictBase) -> None:
         size, kept = self.image_size, self.config.memory_frames
