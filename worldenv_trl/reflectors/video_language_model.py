@@ -62,7 +62,7 @@ class VideoLanguageModel(nn.Module):
         self._colours = (tuple(mean), tuple(std))
         # Causal attention does not look at what is padded behind: no mask, and the fastest kernel serves. Qwen2, told
         # so for its layers, does not look for packed sequences either, for which a GPU would have to be waited for.
-        text = model.get_submodule("model.language_model").config
+        text: Any = model.get_submodule("model.language_model").config
         plain = text.model_type == "qwen2" and set(text.layer_types) == {"full_attention"}
         fused = text._attn_implementation in ("sdpa", "flash_attention_2")
         self._mask = {"full_attention": None} if plain and fused else None
