@@ -42,7 +42,7 @@ def load_diffusers(model: DiffusionWorldModel, folder: str | Path) -> list[str]:
         if name == "unet":
             weights = _widened(weights, own)
         if name == "image_encoder":
-            weights = {key: value for key, value in weights.items() if key in own}  # without the projection to text
+            weights = _tower(weights, own)
         _check(folder / name, weights, own)
         part.load_state_dict(weights)
         loaded.append(name)
@@ -75,6 +75,14 @@ def _widened(weights: dict[str, Tensor], own: dict[str, Tensor]) -> dict[str, Te
     if first is None or first.shape[1] >= wanted.shape[1]:
         return weights
     return weights | {_FIRST: nn.functional.pad(first, (0, 0, 0, 0, 0, wanted.shape[1] - first.shape[1]))}
+
+
+def _tower(weights: dict[str, Tensor], own: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The vision tower alone, without a projection to text; versions of transformers differ in its prefix."""
+    prefix = "vision_model."
+    bare = {name.removeprefix(prefix): value for name, value in weights.items()}
+    known = {name: bare.get(name.removeprefix(prefix)) for name in own}
+    return {name: value for name, value in known.items() if value is not None}
 
 
 def _check(folder: Path, weights: dict[str, Tensor], own: dict[str, Tensor]) -> None:

@@ -147,6 +147,13 @@ class DiffusionWorldModel(WorldModel, Pretrained):
 
     def _paint(self, tensordict: TensorDictBase, texts: Sequence[str]) -> Tensor:
         """uint8 [B, V, C, 3, H, W]."""
+        images = self.decode(self.sample(tensordict, texts))
+        size = (self.image_size, self.image_size)
+        return to_uint8(resized(images.flatten(0, 2), size)).unflatten(0, images.shape[:3])
+
+    @torch.no_grad()
+    def sample(self, tensordict: TensorDictBase, texts: Sequence[str]) -> Tensor:
+        """Latents float32 [B, C, z, h, w] of the chunk that a request asks for."""
         seed, conditions = tensordict.get(NOISE_SEED, None), self.conditions(tensordict, texts)
         shape = (self.chunk_length, *conditions.memory.shape[2:])
 
@@ -159,8 +166,7 @@ class DiffusionWorldModel(WorldModel, Pretrained):
         def predict(noisy: Tensor, timestep: int) -> Tensor:
             return self.predict_v(noisy, torch.full((len(texts),), timestep, device=noisy.device), conditions)
 
-        latents = ddim(self.scheduler, predict, draw(0), self.num_denoise_steps, self.eta, draw)
-        return to_uint8(resized_views(self.decode(latents), self.image_size))
+        return ddim(self.scheduler, predict, draw(0), self.num_denoise_steps, self.eta, draw)
 
     # ------------------------------------------------------------------------------------------------- network
 
@@ -255,8 +261,3 @@ class DiffusionWorldModel(WorldModel, Pretrained):
         for key, width in ((POSES, POSE_DIM), (PADDED_ACTIONS, PADDED_ACTION_DIM)):
             if tuple(tensordict[key].shape[1:]) != (self.chunk_length, width):
                 raise ValueError(f"{key} must be [B, {self.chunk_length}, {width}], got {tuple(tensordict[key].shape)}")
-
-
-def resized_views(images: Tensor, size: int) -> Tensor:
-    """Images [B, V, C, 3, H, W] as [B, V, C, 3, size, size]."""
-    return resized(images.flatten(0, 2), (size, size)).unflatten(0, images.shape[:3])
