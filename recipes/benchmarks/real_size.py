@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import torch
 import tyro
-from real_size_row import Costs, Row, Work, costs, free, measured_call, measured_training
+from real_size_row import Costs, Row, Work, costs, empty, free, measured_call, measured_training
 from torch import nn
 
 from command_line import refusals
@@ -32,7 +32,7 @@ from worldenv_trl.devices import choose_device
 
 Result = TypeVar("Result")
 
-FAMILIES = {"policy": "real_size_policy"}
+FAMILIES = {"policy": "real_size_policy", "models": "real_size_models"}
 """By the name of the part: the module beside this one whose ``ROWS`` are its rows."""
 
 
@@ -154,6 +154,7 @@ def _measure(row: Row, counted: Costs, device: torch.device, gpu: GPU | None, mo
         row.compile(module)
     for work in counted.calls:
         _guarded(row, partial(_measure_call, row, module, work, counted.weight_bytes, device, gpu, mode))
+        empty(device)
     if training:
         _guarded(row, partial(_measure_training, row, module, counted, device, gpu, mode))
 

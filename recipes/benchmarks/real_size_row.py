@@ -164,6 +164,11 @@ def measured_training(row: Row, module: nn.Module, repeats: int = 3) -> float:
 def free(device: torch.device) -> None:
     """Gives back what the last row held."""
     torch.compiler.reset()
+    empty(device)
+
+
+def empty(device: torch.device) -> None:
+    """Gives back what nobody holds any more."""
     gc.collect()
     if device.type == "cuda":
         torch.cuda.empty_cache()

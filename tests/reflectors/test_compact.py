@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from worldenv_trl.reflectors import CompactReflector, CompactReflectorConfig
-from worldenv_trl.reflectors.compact import prefix_indices
+from worldenv_trl.reflectors.prefixes import prefix_indices
 
 TEXTS = ("open the drawer", "put the left bowl on the right bowl", "put the right bowl on the left bowl")
 

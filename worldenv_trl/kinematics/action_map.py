@@ -82,13 +82,13 @@ class ActionMap(nn.Module):
         positions = [torch.tensor(item.position, dtype=torch.float32) for item in cameras]
         rotations = [torch.tensor(item.rotation, dtype=torch.float32).reshape(3, 3) for item in cameras]
         fovy = torch.tensor([float(item.fovy) for item in cameras]).deg2rad()
-        on_tool = torch.tensor([item.mount == "tool" for item in cameras])
+        mounted = [item.mount == "tool" for item in cameras]
         self._names = [item.name for item in cameras]
-        self._any_on_tool, self._all_on_tool = bool(on_tool.any()), bool(on_tool.all())
+        self._any_on_tool, self._all_on_tool = any(mounted), all(mounted)
         # The cameras belong to the configuration of whoever uses the map: not to its weights.
         self.register_buffer("_position", torch.stack(positions), persistent=False)
         self.register_buffer("_rotation", torch.stack(rotations), persistent=False)
-        self.register_buffer("_on_tool", on_tool, persistent=False)
+        self.register_buffer("_on_tool", torch.tensor(mounted), persistent=False)
         self.register_buffer("_focal", self.height / 2 / torch.tan(fovy / 2), persistent=False)
         self.register_buffer("_column", torch.arange(self.width, dtype=torch.float32) + 0.5, persistent=False)
         self.register_buffer("_row", torch.arange(self.height, dtype=torch.float32) + 0.5, persistent=False)
@@ -209,6 +209,29 @@ class ActionMap(nn.Module):
                 part = slice(first, first + _ROWS_PER_CHUNK)
                 maps[part] = self._draw(pose[part], index[part], None if tool is None else tool[part])
         return maps.reshape(*batch, self.channels, self.height, self.width)
+
+    def rays(self, tool_pose: Tensor, size: tuple[int, int], camera_index: Tensor | None = None) -> Tensor:
+        """Where every cell of a grid over the image looks from, and to: [*B, 6, h, w].
+
+        Args:
+            tool_pose: where the tool is when the picture is taken, [*B, 13].
+            size: rows and columns of the grid, which need not be square; the image is.
+            camera_index: as in :meth:`forward`.
+
+        Returns:
+            World coordinates of the camera's centre (m) and the unit vector through each cell's centre.
+        """
+        batch = tool_pose.shape[:-1]
+        index = self._camera_index(batch, camera_index).reshape(-1)
+        position, rotation = self._views(index, self._tool_poses(batch, tool_pose))
+        device = position.device
+        down, across = ((torch.arange(count, device=device) + 0.5) * (2 / count) - 1 for count in size)
+        tangent = (self.height / 2 / self._focal[index]).view(-1, 1, 1)
+        x, y = torch.broadcast_tensors(tangent * across, -tangent * down.unsqueeze(-1))  # [n, h, w]
+        local = torch.nn.functional.normalize(torch.stack([x, y, -torch.ones_like(x)], 1), dim=1)
+        direction = torch.einsum("nij,njhw->nihw", rotation, local)
+        origin = position[..., None, None].expand_as(direction)
+        return torch.cat([origin, direction], 1).reshape(*batch, 6, *size)
 
     def _draw(self, pose: Tensor, index: Tensor, tool_pose: Tensor | None) -> Tensor:
         position, rotation, opening = pose[:, :3], pose[:, 3:12].reshape(-1, 3, 3), pose[:, 12].clamp(0, 1)

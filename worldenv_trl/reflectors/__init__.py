@@ -4,12 +4,19 @@ from worldenv_trl.reflectors.base import Lesson, Reflector
 from worldenv_trl.reflectors.compact import CompactReflector, CompactReflectorConfig
 from worldenv_trl.reflectors.compact_lessons import CompactLessons
 from worldenv_trl.reflectors.stop_rule import StopRule
+from worldenv_trl.reflectors.vlm import PromptReflector, PromptReflectorConfig, VLMReflector, VLMReflectorConfig
+from worldenv_trl.reflectors.vlm_lessons import VLMLessons
 
 __all__ = [
     "CompactLessons",
     "CompactReflector",
     "CompactReflectorConfig",
     "Lesson",
+    "PromptReflector",
+    "PromptReflectorConfig",
     "Reflector",
     "StopRule",
+    "VLMLessons",
+    "VLMReflector",
+    "VLMReflectorConfig",
 ]

@@ -16,6 +16,7 @@ from worldenv_trl.language import Vocabulary
 from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.reflectors.base import Lesson, Reflector
 from worldenv_trl.reflectors.compact_lessons import CompactLessons, lessons_of
+from worldenv_trl.reflectors.prefixes import prefix_indices
 from worldenv_trl.vision import PretrainedEncoder
 
 if TYPE_CHECKING:
@@ -299,23 +300,6 @@ class _Goal(nn.Module):
         embedded = self.words(words) * (1 + self.places[: words.shape[1]])
         # Divided by the root, so that long and short instructions start with vectors of the same length.
         return self.out(embedded.sum(1) / (words > 0).sum(1, keepdim=True) ** 0.5)
-
-
-def prefix_indices(lengths: Tensor, num_frames: int) -> Tensor:
-    """Which frames of a prefix are looked at: spread evenly, the first and the last among them.
-
-    Args:
-        lengths: int64 [P], frames in each prefix, at least 1.
-        num_frames: most frames looked at.
-
-    Returns:
-        int64 [P, L] with ``L = min(num_frames, max(lengths))``; shorter prefixes repeat their last frame.
-    """
-    count = int(min(num_frames, int(lengths.max())))
-    slots = torch.arange(count, device=lengths.device)
-    shown = lengths.clamp(max=count)
-    spread = (slots * (lengths - 1).unsqueeze(-1)).float() / (shown - 1).clamp(min=1).unsqueeze(-1)
-    return torch.minimum(spread.round().long(), (lengths - 1).unsqueeze(-1))
 
 
 def _parameters(*modules: nn.Module) -> list[nn.Parameter]:

@@ -3,7 +3,21 @@
 from __future__ import annotations
 
 from worldenv_trl.world_models.base import WorldModel, memory_key, reference_key, request
+from worldenv_trl.world_models.diffusion_config import DiffusionWorldModelConfig
+from worldenv_trl.world_models.diffusion_weights import load_diffusers
+from worldenv_trl.world_models.diffusion_world_model import DiffusionWorldModel
 from worldenv_trl.world_models.video_world_model import VideoWorldModel, VideoWorldModelConfig
 from worldenv_trl.world_models.window import Window
 
-__all__ = ["VideoWorldModel", "VideoWorldModelConfig", "Window", "WorldModel", "memory_key", "reference_key", "request"]
+__all__ = [
+    "DiffusionWorldModel",
+    "DiffusionWorldModelConfig",
+    "VideoWorldModel",
+    "VideoWorldModelConfig",
+    "Window",
+    "WorldModel",
+    "load_diffusers",
+    "memory_key",
+    "reference_key",
+    "request",
+]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, cast
@@ -25,6 +24,7 @@ from worldenv_trl.world_models.base import (
     memory_key,
     reference_key,
 )
+from worldenv_trl.world_models.calibrations import Calibrations
 from worldenv_trl.world_models.cells import from_cells, to_cells, to_float, to_uint8
 from worldenv_trl.world_models.denoiser import Denoiser, View
 from worldenv_trl.world_models.flow_matching import sample, seeded_noise
@@ -170,7 +170,7 @@ class VideoWorldModel(WorldModel, Pretrained):
         )
         self.config = config
         self.deterministic, self.num_denoise_steps = config.deterministic, config.num_denoise_steps
-        self._views = [_Calibrations(by_text) for by_text in config.cameras.values()]
+        self._views = [Calibrations(by_text) for by_text in config.cameras.values()]
         side = config.image_size // config.patch
         self.action_maps = torch.nn.ModuleList(ActionMap(view.distinct, side) for view in self._views)
         chunk = config.chunk_length
@@ -243,7 +243,7 @@ class VideoWorldModel(WorldModel, Pretrained):
         """What one camera shows; ``every`` [B, M + C, 13] are the poses of memory and chunk."""
         camera, calibrations = self.cameras[index], self._views[index]
         action_map = cast(ActionMap, self.action_maps[index])
-        which = calibrations.indices(texts)  # [B], on the CPU: it is checked there, and a GPU does not wait
+        which = calibrations.indices(texts)  # [B]
         poses, size = every[:, _MEMORY:], self.image_size
         if calibrations.any_mounted:
             mounted = calibrations.mounted[which].to(every.device).view(-1, 1, 1)
@@ -298,23 +298,3 @@ class VideoWorldModel(WorldModel, Pretrained):
         for key, width in ((POSES, POSE_DIM), (PADDED_ACTIONS, PADDED_ACTION_DIM)):
             if tuple(tensordict[key].shape[1:]) != (chunk, width):
                 raise ValueError(f"{key} must be [B, {chunk}, {width}], got {tuple(tensordict[key].shape)}")
-
-
-class _Calibrations:
-    """The distinct calibrations of one camera, and which of them an instruction's scene has."""
-
-    def __init__(self, by_instruction: Mapping[str, Mapping[str, Any]]) -> None:
-        self.distinct: list[Camera] = []
-        self._index: dict[str, int] = {}
-        for text, values in by_instruction.items():
-            camera = Camera(**values)
-            if camera not in self.distinct:
-                self.distinct.append(camera)
-            self._index[text] = self.distinct.index(camera)
-        self._commonest = Counter(self._index.values()).most_common(1)[0][0]
-        self.mounted = torch.tensor([camera.mount == "tool" for camera in self.distinct])
-        self.any_mounted = bool(self.mounted.any())
-
-    def indices(self, texts: Sequence[str]) -> Tensor:
-        """int64 [n]."""
-        return torch.tensor([self._index.get(text, self._commonest) for text in texts], dtype=torch.int64)

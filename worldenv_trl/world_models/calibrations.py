@@ -1,0 +1,35 @@
+"""Which camera an instruction's scene is seen through."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from worldenv_trl.robot.camera import Camera
+
+__all__ = ["Calibrations"]
+
+
+class Calibrations:
+    """The distinct calibrations of one camera, and which of them an instruction's scene has."""
+
+    def __init__(self, by_instruction: Mapping[str, Mapping[str, Any]]) -> None:
+        self.distinct: list[Camera] = []
+        self._index: dict[str, int] = {}
+        for text, values in by_instruction.items():
+            camera = Camera(**values)
+            if camera not in self.distinct:
+                self.distinct.append(camera)
+            self._index[text] = self.distinct.index(camera)
+        self._commonest = Counter(self._index.values()).most_common(1)[0][0]
+        mounted = [camera.mount == "tool" for camera in self.distinct]
+        self.mounted, self.any_mounted = torch.tensor(mounted, device="cpu"), any(mounted)
+
+    def indices(self, texts: Sequence[str]) -> Tensor:
+        """int64 [n], on the CPU: it is checked there, and a GPU does not wait."""
+        index = [self._index.get(text, self._commonest) for text in texts]
+        return torch.tensor(index, dtype=torch.int64, device="cpu")
