@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from worldenv_trl.robot.camera import Camera
 
 __all__ = ["CONDITION_CHANNELS", "DiffusionWorldModelConfig"]
@@ -16,6 +18,7 @@ CONDITION_CHANNELS = (
     7  # beside the latents of noise, image and action map: the memory's mask, a ray's origin, direction
 )
 
+_MOST_SEQUENCES = 65_535  # that a GPU's attention kernel takes at once: every cell has one over time
 _BLOCKS = 3
 _VAE = {  # Stable Diffusion's: 8 x 8 pixels to one of 4 channels
     "in_channels": 3,
@@ -84,7 +87,7 @@ class DiffusionWorldModelConfig:
     precision: str = "auto"
     """``float32``, ``bfloat16`` (autocast) or ``auto``: bfloat16 on a GPU."""
     rows_per_call: int | None = None
-    """Rows that are painted at once; None is 1 on a CPU and 8 on a GPU."""
+    """Rows that are painted at once; None is 1 on a CPU and up to 8 on a GPU."""
     frames_per_call: int = 16
     """Frames that pass through the VAE at once."""
     gradient_checkpointing: bool = False
@@ -127,6 +130,15 @@ class DiffusionWorldModelConfig:
     def latent_size(self) -> tuple[int, int]:
         """Height and width of one view's latents."""
         return self.frame_size[0] // self.latent_scale, self.frame_size[1] // self.latent_scale
+
+    def rows_at_once(self, device: torch.device) -> int:
+        """:attr:`rows_per_call`, or what it is on ``device`` when that is None."""
+        if self.rows_per_call is not None:
+            return self.rows_per_call
+        if device.type == "cpu":
+            return 1
+        height, width = self.latent_size
+        return max(1, min(8, _MOST_SEQUENCES // (max(1, len(self.cameras)) * height * width)))
 
     @property
     def frames(self) -> int:

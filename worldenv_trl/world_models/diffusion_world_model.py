@@ -135,8 +135,7 @@ class DiffusionWorldModel(WorldModel, Pretrained):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._check(tensordict)
-        texts, device = instructions_of(tensordict), tensordict[POSES].device
-        rows = self.config.rows_per_call or (1 if device.type == "cpu" else 8)
+        texts, rows = instructions_of(tensordict), self.config.rows_at_once(tensordict[POSES].device)
         painted = [
             self._paint(tensordict[start : start + rows], texts[start : start + rows])
             for start in range(0, len(texts), rows)
