@@ -150,6 +150,7 @@ def test_it_is_saved_and_paints_the_same_again(model, tmp_path):
         ({"memory_frames": 1}, "memory_frames must be at least 2"),
         ({"chunk_length": 0}, "chunk_length, context_queries, .* must be at least 1"),
         ({"num_denoise_steps": 0}, "num_denoise_steps must lie between 1 and 1000, got 0"),
+        ({"consistency_steps": 1}, "consistency_steps must lie between 2 and 1000, got 1"),
         ({"eta": 1.5}, r"eta must lie in \[0, 1\]"),
         ({"precision": "half"}, "precision must be auto, float32 or bfloat16, got 'half'"),
     ],

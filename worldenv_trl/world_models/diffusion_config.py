@@ -82,6 +82,9 @@ class DiffusionWorldModelConfig:
     """Of DDIM; 1 to 4 for a model that was trained or distilled to few."""
     eta: float = 1.0
     """0 adds no noise between steps, 1 as much as DDPM."""
+    consistency_steps: int | None = None
+    """In training, the network learns to jump to the clean end from each of so many noise levels (consistency training)
+    instead of v; 1 to 4 denoising steps then paint. Begin with a network that has learned v. None learns v."""
     memory_noise: float = 0.1
     """In training, remembered latents are disturbed by up to this standard deviation, which the network is told."""
     precision: str = "auto"
@@ -114,6 +117,8 @@ class DiffusionWorldModelConfig:
             )
         if not 1 <= self.num_denoise_steps <= 1000:
             raise ValueError(f"num_denoise_steps must lie between 1 and 1000, got {self.num_denoise_steps}")
+        if self.consistency_steps is not None and not 2 <= self.consistency_steps <= 1000:
+            raise ValueError(f"consistency_steps must lie between 2 and 1000, got {self.consistency_steps}")
         if not 0 <= self.eta <= 1 or self.memory_noise < 0:
             raise ValueError(
                 f"eta must lie in [0, 1] and memory_noise not below 0, got {self.eta}, {self.memory_noise}"
