@@ -46,7 +46,7 @@ def test_the_world_model_learns_there(gpu):
     model = make_diffusion(TWO, precision="float32").train().to(gpu)
     loss = WorldModelLoss(model)(make_windows(model).to(gpu))["loss_world_model"]
     loss.backward()
-    assert loss.device.type == "cuda" and model.unet.conv_in.weight.grad.device.type == "cuda"
+    assert loss.device.type == "cuda" and model.unet.net.conv_in.weight.grad.device.type == "cuda"
 
 
 @pytest.mark.parametrize("kind", ["head", "prompt"])

@@ -108,8 +108,8 @@ def test_with_one_time_and_one_context_it_is_diffusers_own_unet():
     from diffusers import UNetSpatioTemporalConditionModel
 
     model = make_diffusion()
-    plain = UNetSpatioTemporalConditionModel.from_config(model.unet.config).eval()
-    plain.load_state_dict(model.unet.state_dict())
+    plain = UNetSpatioTemporalConditionModel.from_config(model.unet.net.config).eval()
+    plain.load_state_dict(model.unet.net.state_dict())
     sample, context = torch.randn(2, 5, 19, 8, 12), torch.randn(2, 3, 16)
     added, times = torch.rand(2, 3), torch.tensor([17, 400])
     with torch.no_grad():

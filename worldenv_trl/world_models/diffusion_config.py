@@ -191,7 +191,7 @@ class DiffusionWorldModelConfig:
 
 _CLASSES = {
     "vae": ("AutoencoderKL",),
-    "unet": ("UNetSpatioTemporalConditionModel", "VideoUNet"),
+    "unet": ("UNetSpatioTemporalConditionModel",),
     "image_encoder": ("CLIPVisionModel", "CLIPVisionModelWithProjection", "SiglipVisionModel"),
 }
 _REMEDY = {
