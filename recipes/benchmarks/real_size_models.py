@@ -129,7 +129,7 @@ def make_world_model(**settings: Any) -> DiffusionWorldModel:
 
 def asked(model: DiffusionWorldModel, batch: int) -> TensorDict:
     """A request of noise, and the frames to learn from."""
-    device, kept, length = model.unet.device, model.config.memory_frames, model.chunk_length
+    device, kept, length = model.unet.net.device, model.config.memory_frames, model.chunk_length
 
     def video(count: int) -> Tensor:
         return torch.randint(0, 256, (batch, count, 3, IMAGE_SIZE, IMAGE_SIZE), dtype=torch.uint8, device=device)

@@ -10,7 +10,9 @@ import pytest
 import torch
 from stand_in import stand_in
 
-sys.path += [str(Path(__file__).parents[1] / part) for part in ("policies", "world_models", "envs")]  # small parts
+sys.path += [
+    str(Path(__file__).parents[1] / part) for part in ("policies", "world_models", "envs", "reflectors")
+]  # small parts
 
 
 @pytest.fixture

@@ -43,7 +43,7 @@ def tiny_rows(monkeypatch):
     small = {key: value for key, value in SMALL.items() if key != "image_size"}
     return [
         real_size_models.reflector_row("tiny-reflector", **TEXT),
-        real_size_models.world_model_row("tiny-world-model", (1, 2), **small),
+        real_size_models.world_model_row("tiny-world-model", (2,), **small),
     ]
 
 
@@ -75,5 +75,5 @@ def test_the_full_world_model_is_counted_without_memory():
     (row,) = (row for row in real_size_models.ROWS if row.name == "world-model-evac-4-steps")
     with torch.device("meta"):
         model = row.make()
-    assert model.unet.config.in_channels == 19 and model.unet.device.type == "meta"
+    assert model.unet.net.config.in_channels == 19 and model.unet.net.device.type == "meta"
     assert 1.4e9 < sum(parameter.numel() for parameter in model.unet.parameters()) < 1.7e9

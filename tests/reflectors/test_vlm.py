@@ -12,6 +12,7 @@ from tiny_vlm import WORDS, save_tiny_vlm, tiny_model, tiny_tokenizer
 from videos import patches
 
 from worldenv_trl.data import score_episodes
+from worldenv_trl.objectives import ReflectorLoss
 from worldenv_trl.reflectors import PromptReflector, PromptReflectorConfig, VLMReflector, VLMReflectorConfig
 from worldenv_trl.reflectors.video_language_model import VideoLanguageModel
 
@@ -234,3 +235,15 @@ def test_a_model_of_another_class_is_refused():
     model.config.model_type = "qwen2"
     with pytest.raises(ValueError, match="got a qwen2: name a LLaVA-OneVision"):
         VideoLanguageModel(model, tiny_tokenizer())
+
+
+def test_what_a_training_continues_from_is_the_head_alone(folder, reflector):
+    state = ReflectorLoss(reflector).state_dict()
+    assert {name.split(".")[1] for name in state} == {"head", "log_scale", "shift"}
+    torch.manual_seed(9)
+    fresh = VLMReflector(reflector.config, vlm=reflector.vlm)
+    loss = ReflectorLoss(fresh)
+    loss.load_state_dict(state)
+    assert all(torch.equal(a, b) for a, b in zip(fresh.head.parameters(), reflector.head.parameters(), strict=True))
+    with pytest.raises(RuntimeError, match=r"Missing key\(s\) in state_dict: .*head\.3\.bias"):
+        fresh.load_state_dict({name: value for name, value in fresh.state_dict().items() if name != "head.3.bias"})

@@ -33,7 +33,7 @@ def test_the_loss_is_the_error_of_v(monkeypatch, answer):
         velocities.append(velocity(*given))
         return velocities[-1]
 
-    def predict(noisy, timesteps, conditions, disturbed):
+    def predict(noisy, timesteps, conditions, memory_noise):
         alpha = model.scheduler.alphas_cumprod[timesteps].view(-1, 1, 1, 1, 1)
         clean = torch.cat([model.encode(to_float(windows[frames_key(c)][:, 1:5])) for c in model.cameras], -2)
         return (alpha.sqrt() * noisy - clean) / (1 - alpha).sqrt() * (answer == "the truth")
@@ -54,7 +54,9 @@ def test_steps_past_the_end_of_an_episode_do_not_count():
     first = loss_of(model, windows)
     model_sees = model.predict_v
     # The network's own view of the frames stays; only what the masked frames should have been changes.
-    model.predict_v = lambda *given: model_sees(*given) + 100 * torch.tensor([0.0, 0, 1, 1]).view(1, 4, 1, 1, 1)
+    model.predict_v = lambda *given, **known: (
+        model_sees(*given, **known) + 100 * torch.tensor([0.0, 0, 1, 1]).view(1, 4, 1, 1, 1)
+    )
     assert loss_of(model, windows).item() == pytest.approx(first.item())
     windows["step_mask"][:, 2] = True
     assert loss_of(model, windows) > 100 * first
@@ -84,7 +86,7 @@ def test_disturbed_memory_is_drawn_up_to_its_level_and_told(monkeypatch):
     model, told = make_diffusion(memory_noise=0.5), []
     predict = model.predict_v
     monkeypatch.setattr(
-        model, "predict_v", lambda n, t, known, level: (told.append((known, level)), predict(n, t, known, level))[1]
+        model, "predict_v", lambda *given, **known: (told.append(tuple(known.values())), predict(*given, **known))[1]
     )
     windows = make_windows(model, (0,) * 6, 1)
     clean = model.conditions(asked_of(model, windows), [PULL] * 6).memory

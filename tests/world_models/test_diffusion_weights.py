@@ -69,14 +69,14 @@ def test_a_widened_unet_begins_as_the_pretrained_one(pretrained, model):
     model.predict_v(
         torch.randn(1, 4, 4, 8, 12), torch.tensor([30]), model.conditions(ask(model, 1), [PULL])
     ).square().sum().backward()
-    assert model.unet.conv_in.weight.grad[:, 8:].abs().sum() > 0  # and learns what the other channels say
+    assert model.unet.net.conv_in.weight.grad[:, 8:].abs().sum() > 0  # and learns what the other channels say
 
 
 def test_what_a_folder_does_not_have_is_left_alone(pretrained, model, tmp_path):
     (tmp_path / "vae").symlink_to(pretrained[0] / "vae")
-    before = model.unet.conv_in.weight.clone()
+    before = model.unet.net.conv_in.weight.clone()
     assert load_diffusers(model, tmp_path) == ["vae"]
-    assert torch.equal(model.unet.conv_in.weight, before)
+    assert torch.equal(model.unet.net.conv_in.weight, before)
 
 
 def test_a_folder_with_nothing_is_refused(model, tmp_path):

@@ -108,8 +108,8 @@ def test_with_one_time_and_one_context_it_is_diffusers_own_unet():
     from diffusers import UNetSpatioTemporalConditionModel
 
     model = make_diffusion()
-    plain = UNetSpatioTemporalConditionModel.from_config(model.unet.config).eval()
-    plain.load_state_dict(model.unet.state_dict())
+    plain = UNetSpatioTemporalConditionModel.from_config(model.unet.net.config).eval()
+    plain.load_state_dict(model.unet.net.state_dict())
     sample, context = torch.randn(2, 5, 19, 8, 12), torch.randn(2, 3, 16)
     added, times = torch.rand(2, 3), torch.tensor([17, 400])
     with torch.no_grad():
@@ -150,6 +150,7 @@ def test_it_is_saved_and_paints_the_same_again(model, tmp_path):
         ({"memory_frames": 1}, "memory_frames must be at least 2"),
         ({"chunk_length": 0}, "chunk_length, context_queries, .* must be at least 1"),
         ({"num_denoise_steps": 0}, "num_denoise_steps must lie between 1 and 1000, got 0"),
+        ({"consistency_steps": 1}, "consistency_steps must lie between 2 and 1000, got 1"),
         ({"eta": 1.5}, r"eta must lie in \[0, 1\]"),
         ({"precision": "half"}, "precision must be auto, float32 or bfloat16, got 'half'"),
     ],

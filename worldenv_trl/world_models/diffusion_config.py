@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from worldenv_trl.robot.camera import Camera
 
 __all__ = ["CONDITION_CHANNELS", "DiffusionWorldModelConfig"]
@@ -16,6 +18,7 @@ CONDITION_CHANNELS = (
     7  # beside the latents of noise, image and action map: the memory's mask, a ray's origin, direction
 )
 
+_MOST_SEQUENCES = 65_535  # that a GPU's attention kernel takes at once: every cell has one over time
 _BLOCKS = 3
 _VAE = {  # Stable Diffusion's: 8 x 8 pixels to one of 4 channels
     "in_channels": 3,
@@ -79,12 +82,15 @@ class DiffusionWorldModelConfig:
     """Of DDIM; 1 to 4 for a model that was trained or distilled to few."""
     eta: float = 1.0
     """0 adds no noise between steps, 1 as much as DDPM."""
+    consistency_steps: int | None = None
+    """In training, the network learns to jump to the clean end from each of so many noise levels (consistency training)
+    instead of v; 1 to 4 denoising steps then paint. Begin with a network that has learned v. None learns v."""
     memory_noise: float = 0.1
     """In training, remembered latents are disturbed by up to this standard deviation, which the network is told."""
     precision: str = "auto"
     """``float32``, ``bfloat16`` (autocast) or ``auto``: bfloat16 on a GPU."""
     rows_per_call: int | None = None
-    """Rows that are painted at once; None is 1 on a CPU and 8 on a GPU."""
+    """Rows that are painted at once; None is 1 on a CPU and up to 8 on a GPU."""
     frames_per_call: int = 16
     """Frames that pass through the VAE at once."""
     gradient_checkpointing: bool = False
@@ -111,6 +117,8 @@ class DiffusionWorldModelConfig:
             )
         if not 1 <= self.num_denoise_steps <= 1000:
             raise ValueError(f"num_denoise_steps must lie between 1 and 1000, got {self.num_denoise_steps}")
+        if self.consistency_steps is not None and not 2 <= self.consistency_steps <= 1000:
+            raise ValueError(f"consistency_steps must lie between 2 and 1000, got {self.consistency_steps}")
         if not 0 <= self.eta <= 1 or self.memory_noise < 0:
             raise ValueError(
                 f"eta must lie in [0, 1] and memory_noise not below 0, got {self.eta}, {self.memory_noise}"
@@ -127,6 +135,15 @@ class DiffusionWorldModelConfig:
     def latent_size(self) -> tuple[int, int]:
         """Height and width of one view's latents."""
         return self.frame_size[0] // self.latent_scale, self.frame_size[1] // self.latent_scale
+
+    def rows_at_once(self, device: torch.device) -> int:
+        """:attr:`rows_per_call`, or what it is on ``device`` when that is None."""
+        if self.rows_per_call is not None:
+            return self.rows_per_call
+        if device.type == "cpu":
+            return 1
+        height, width = self.latent_size
+        return max(1, min(8, _MOST_SEQUENCES // (max(1, len(self.cameras)) * height * width)))
 
     @property
     def frames(self) -> int:
@@ -174,7 +191,7 @@ class DiffusionWorldModelConfig:
 
 _CLASSES = {
     "vae": ("AutoencoderKL",),
-    "unet": ("UNetSpatioTemporalConditionModel", "VideoUNet"),
+    "unet": ("UNetSpatioTemporalConditionModel",),
     "image_encoder": ("CLIPVisionModel", "CLIPVisionModelWithProjection", "SiglipVisionModel"),
 }
 _REMEDY = {

@@ -32,7 +32,7 @@ def load_diffusers(model: DiffusionWorldModel, folder: str | Path) -> list[str]:
         ValueError: for weights of other shapes or names, or that are only there as pickles.
     """
     folder, loaded = Path(folder), []
-    parts: dict[str, Any] = {"vae": model.vae, "unet": model.unet, "image_encoder": model.context.encoder}
+    parts: dict[str, Any] = {"vae": model.vae, "unet": model.unet.net, "image_encoder": model.context.encoder}
     found = {name: part for name, part in parts.items() if (folder / name / "config.json").exists()}
     if not found:
         raise FileNotFoundError(f"no vae, unet or image_encoder in {folder}: name a folder in the layout of diffusers")

@@ -28,6 +28,7 @@ from worldenv_trl.world_models.diffusion_conditioning import ContextTokens, View
 from worldenv_trl.world_models.diffusion_config import CONDITION_CHANNELS, DiffusionWorldModelConfig
 from worldenv_trl.world_models.diffusion_process import ddim, make_scheduler
 from worldenv_trl.world_models.diffusion_training import diffusion_loss
+from worldenv_trl.world_models.diffusion_unet import VideoUNet
 from worldenv_trl.world_models.flow_matching import seeded_noise
 from worldenv_trl.world_models.noise_seeds import noise_seeds
 
@@ -73,8 +74,6 @@ class DiffusionWorldModel(WorldModel, Pretrained):
     def __init__(self, config: DiffusionWorldModelConfig) -> None:
         from diffusers import AutoencoderKL
 
-        from worldenv_trl.world_models.diffusion_unet import VideoUNet
-
         if not config.instructions or len({tuple(each) for each in config.cameras.values()}) > 1:
             raise ValueError(
                 "cameras must name at least one camera, with the same instructions, at least one, for each: "
@@ -100,7 +99,7 @@ class DiffusionWorldModel(WorldModel, Pretrained):
             "addition_time_embed_dim": 256,
             "projection_class_embeddings_input_dim": 256 * _ADDED_IDS,
         }
-        self.unet: Any = VideoUNet.from_config(config.unet | sizes)
+        self.unet = VideoUNet(config.unet | sizes)
         if config.gradient_checkpointing:
             self.unet.checkpoint_activations()
         for module in self.modules():  # the layout of a GPU's convolutions
@@ -135,8 +134,7 @@ class DiffusionWorldModel(WorldModel, Pretrained):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._check(tensordict)
-        texts, device = instructions_of(tensordict), tensordict[POSES].device
-        rows = self.config.rows_per_call or (1 if device.type == "cpu" else 8)
+        texts, rows = instructions_of(tensordict), self.config.rows_at_once(tensordict[POSES].device)
         painted = [
             self._paint(tensordict[start : start + rows], texts[start : start + rows])
             for start in range(0, len(texts), rows)
