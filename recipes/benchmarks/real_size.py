@@ -128,7 +128,7 @@ def _count(row: Row) -> Costs:
         units = work.batch * row.units_per_row
         print(
             f"  {row.unit}, batch {work.batch}: {work.flops / units / 1e12:.3f} TFLOP each, activations "
-            f"{_gb(work.peak_bytes)}; bound {_bounds(work, counted.weight_bytes, units)} s each"
+            f"{_gb(work.peak_bytes)}; bound {_bounds(work, units)} s each"
         )
     work = counted.training
     print(
@@ -136,14 +136,14 @@ def _count(row: Row) -> Costs:
         f"TFLOP; weights {_gb(counted.training_weight_bytes)}, optimiser {_gb(counted.optimizer_bytes)}, gradients and "
         f"activations {_gb(work.peak_bytes)}: {_gb(counted.training_bytes)}, too much for "
         f"{', '.join(each.name for each in GPUS if each.memory < counted.training_bytes) or 'none'}; "
-        f"bound {_bounds(work, counted.training_weight_bytes, 1)} s",
+        f"bound {_bounds(work, 1)} s",
         flush=True,
     )
     return counted
 
 
-def _bounds(work: Work, weight_bytes: int, units: int) -> str:
-    return ", ".join(f"{gpu.name} {gpu.bound(work.flops, weight_bytes) / units:.4f}" for gpu in GPUS)
+def _bounds(work: Work, units: int) -> str:
+    return ", ".join(f"{gpu.name} {gpu.bound(work.flops, work.read_bytes) / units:.4f}" for gpu in GPUS)
 
 
 def _measure(row: Row, counted: Costs, device: torch.device, gpu: GPU | None, mode: str, training: bool) -> None:
@@ -153,18 +153,18 @@ def _measure(row: Row, counted: Costs, device: torch.device, gpu: GPU | None, mo
         torch._dynamo.config.recompile_limit = 64  # a graph for each kind of layer, batch and mode, of a fixed shape
         row.compile(module)
     for work in counted.calls:
-        _guarded(row, partial(_measure_call, row, module, work, counted.weight_bytes, device, gpu, mode))
+        _guarded(row, partial(_measure_call, row, module, work, device, gpu, mode))
         empty(device)
     if training:
         _guarded(row, partial(_measure_training, row, module, counted, device, gpu, mode))
 
 
 def _measure_call(
-    row: Row, module: nn.Module, work: Work, weight_bytes: int, device: torch.device, gpu: GPU | None, mode: str
+    row: Row, module: nn.Module, work: Work, device: torch.device, gpu: GPU | None, mode: str
 ) -> None:
     units = work.batch * row.units_per_row
     seconds = measured_call(row, module, work.batch)
-    share = _share(seconds, work.flops, weight_bytes, gpu)
+    share = _share(seconds, work, gpu)
     print(
         f"  measured {row.unit}, batch {work.batch}, {mode}: {seconds / units:.4f} s each{share}{_peak(device)}",
         flush=True,
@@ -176,13 +176,13 @@ def _measure_training(
 ) -> None:
     work = counted.training
     seconds = measured_training(row, module)
-    share = _share(seconds, work.flops, counted.training_weight_bytes, gpu)
+    share = _share(seconds, work, gpu)
     print(f"  measured training step, batch {work.batch}, {mode}: {seconds:.4f} s{share}{_peak(device)}", flush=True)
 
 
-def _share(seconds: float, flops: int, weight_bytes: int, gpu: GPU | None) -> str:
-    rate = f", {flops / seconds / 1e12:.1f} TFLOP/s"
-    return rate if gpu is None else f"{rate}, {gpu.bound(flops, weight_bytes) / seconds:.0%} of {gpu.name}'s bound"
+def _share(seconds: float, work: Work, gpu: GPU | None) -> str:
+    rate = f", {work.flops / seconds / 1e12:.1f} TFLOP/s"
+    return rate if gpu is None else f"{rate}, {gpu.bound(work.flops, work.read_bytes) / seconds:.0%} of {gpu.name}'s bound"
 
 
 def _peak(device: torch.device) -> str:

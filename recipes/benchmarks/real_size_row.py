@@ -50,6 +50,8 @@ class Work:
     flops: int
     peak_bytes: int
     """Of what it allocates beside weights and inputs: activations, and gradients of a training step."""
+    read_bytes: int
+    """Of the parameters that it reads: all of them, but for a head that learns from what was computed once."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,10 @@ class PeakMemory(TorchDispatchMode):
             if isinstance(after, Tensor):
                 self._count(after.untyped_storage())
         return out
+
+    def met(self, tensor: Tensor) -> bool:
+        """Whether an operation has read it, or a view of it."""
+        return tensor.untyped_storage()._cdata in self._known
 
     def _count(self, storage: torch.UntypedStorage) -> None:
         key, size = storage._cdata, storage.nbytes()
@@ -182,7 +188,8 @@ def _work(call: Callable, module: nn.Module, inputs: Any, batch: int, training: 
         with PeakMemory() as memory:
             call(module, inputs)
         module.zero_grad(set_to_none=True)
-    return Work(batch, count, memory.peak)
+    _, read = _size(parameter for parameter in module.parameters() if memory.met(parameter))
+    return Work(batch, count, memory.peak, read)
 
 
 def _size(tensors: Iterable[Tensor]) -> tuple[int, int]:

@@ -54,6 +54,14 @@ def test_costs_are_those_of_arithmetic():
     assert counted.training.flops == 2 * 4 * layer * (DEPTH + 1)  # forward, and one weight's gradient
     assert counted.training_bytes == 2 * DEPTH * layer + 4 * layer + counted.training.peak_bytes
     assert counted.training.peak_bytes >= 2 * layer
+    assert {work.read_bytes for work in (*counted.calls, counted.training)} == {2 * DEPTH * layer}
+
+
+def test_only_what_a_step_reads_counts_for_its_bound():
+    """A head that learns from cached embeddings never touches what they were made with."""
+    counted = costs(stack(loss=lambda module, batch: module[-1](batch).sum()))
+    assert counted.training.read_bytes == 2 * WIDTH * WIDTH
+    assert counted.calls[0].read_bytes == counted.weight_bytes == 2 * DEPTH * WIDTH * WIDTH
 
 
 def test_peak_memory_counts_what_lives_at_one_time_and_views_once():
