@@ -303,8 +303,10 @@ class HFPolicy(Policy, Pretrained):
     @classmethod
     def build(cls, config: HFConfig, folder: Path) -> Self:
         from tokenizers import Tokenizer
+        from transformers.initialization import no_init_weights
 
-        return cls(config, Tokenizer.from_file(str(folder / TOKENIZER_NAME)))
+        with no_init_weights():  # billions of random numbers take minutes
+            return cls(config, Tokenizer.from_file(str(folder / TOKENIZER_NAME)))
 
     def _inject_adapters(self) -> None:
         import peft  # imported where used: it takes seconds
