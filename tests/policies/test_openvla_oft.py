@@ -200,7 +200,7 @@ def swap_heads(folder: Path) -> None:
         (
             rewrite("config.json", lambda fields: fields.update(timm_model_ids=["vit"])),
             ValueError,
-            r"describes a openvla with \['vit'\]: only openvla with vit_large",
+            r"describes an openvla with \['vit'\]: only the one with vit_large",
         ),
     ],
 )
@@ -209,6 +209,26 @@ def test_what_is_wrong_with_a_folder_is_said_in_one_line(damaged, damage, error,
     with pytest.raises(error, match=message) as caught:
         load_openvla_oft(damaged, **SETTINGS)
     assert "\n" not in str(caught.value)
+
+
+def test_another_kind_of_checkpoint_is_named_with_what_reads_it(released, damaged):
+    with pytest.raises(ValueError, match="holds an OpenVLA checkpoint: what reads it is load_openvla_oft"):
+        HFPolicy.from_backbone(released)
+    for fields, message in (
+        ({"model_type": "llava"}, "a model of type 'llava': what reads it is HFPolicy.from_backbone"),
+        ({"class": "HFPolicy", "config": {}}, "a HFPolicy of worldenv_trl: what reads it is HFPolicy.from_pretrained"),
+        ({"type": "pi0", "input_features": {}}, "a LeRobot policy of type 'pi0': what reads it is LeRobot alone"),
+    ):
+        (damaged / "config.json").unlink()
+        (damaged / "config.json").write_text(json.dumps(fields))
+        with pytest.raises(ValueError, match=message):
+            load_openvla_oft(damaged, **SETTINGS)
+
+
+def test_a_repository_that_cannot_be_had_is_named(monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    with pytest.raises(FileNotFoundError, match="there is no folder someone/arm, and the Hugging Face Hub gave no"):
+        load_openvla_oft("someone/arm", **SETTINGS)
 
 
 def test_an_unknown_statistics_key_is_answered_with_those_there_are(released):

@@ -203,7 +203,8 @@ class HFPolicy(Policy, Pretrained):
 
         Args:
             folder: what transformers' ``save_pretrained`` of model and processor wrote: ``config.json``, safetensors,
-                ``tokenizer.json`` and, for mean and deviation of the images, ``preprocessor_config.json``.
+                ``tokenizer.json`` and, for mean and deviation of the images, ``preprocessor_config.json``; or
+                ``owner/name`` of a repository of the Hub that holds these.
 
         Keyword Args:
             device: of the parameters.
@@ -211,7 +212,8 @@ class HFPolicy(Policy, Pretrained):
 
         Raises:
             FileNotFoundError: if one of these files is missing.
-            ValueError: for a family that is not known, or settings that cannot be.
+            ValueError: for a family that is not known, another kind of checkpoint (what reads it is said), or settings
+                that cannot be.
         """
         from worldenv_trl.policies.hf_files import read_backbone
 
