@@ -13,6 +13,7 @@ import sys
 import zlib
 from pathlib import Path
 
+import huggingface_hub
 import numpy as np
 import pytest
 import torch
@@ -225,10 +226,18 @@ def test_another_kind_of_checkpoint_is_named_with_what_reads_it(released, damage
             load_openvla_oft(damaged, **SETTINGS)
 
 
-def test_a_repository_that_cannot_be_had_is_named(monkeypatch):
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    with pytest.raises(FileNotFoundError, match="there is no folder someone/arm, and the Hugging Face Hub gave no"):
-        load_openvla_oft("someone/arm", **SETTINGS)
+def test_a_repository_of_the_hub_is_read_like_a_folder(released, tmp_path, monkeypatch):
+    asked = []
+
+    def snapshot_download(repo_id: str, **options) -> str:
+        asked.append((repo_id, options["allow_patterns"]))
+        return str(released)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    actions = load_openvla_oft("someone/arm", **SETTINGS)(observations())[keys.LOC]
+    torch.testing.assert_close(actions, expected(), rtol=0, atol=1e-4)
+    assert asked == [("someone/arm", ["*.json", "*.safetensors", "*.pt"])]
 
 
 def test_an_unknown_statistics_key_is_answered_with_those_there_are(released):
