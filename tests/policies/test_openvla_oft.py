@@ -119,6 +119,15 @@ def test_adapters_and_a_saved_copy_keep_them(released, tmp_path):
     actions.sum().backward()
 
 
+def test_fine_tuning_on_other_data_keeps_the_bounds_that_the_heads_were_trained_with(released):
+    policy = load_openvla_oft(released, **SETTINGS)
+    policy.fit_statistics(torch.randn(50, 7), torch.randn(50, 7))
+    torch.testing.assert_close(policy(observations())[keys.LOC], expected(), rtol=0, atol=1e-4)
+    low, high = (torch.tensor(REFERENCE["statistics"]["libero_tiny_no_noops"]["action"][q]) for q in ("q01", "q99"))
+    torch.testing.assert_close(policy.action_range[:6], ((high - low) / 2)[:6])
+    assert policy.action_range[6] == 1  # the gripper goes from -1 to +1
+
+
 def test_in_bfloat16_they_are_close(released):
     policy = load_openvla_oft(released, **(SETTINGS | {"dtype": "bfloat16"}))
     assert policy.backbone.model.towers[0].pos_embed.dtype == torch.bfloat16

@@ -100,6 +100,7 @@ def load_openvla_oft(
         "chunk_length": 8,
         "proprio": "measured",
         "proprio_format": "libero",
+        "fixed_statistics": True,
         "resolution": side,
         "image_mean": (0.0, 0.0, 0.0),  # the towers have their own
         "image_std": (1.0, 1.0, 1.0),
