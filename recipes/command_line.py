@@ -29,6 +29,11 @@ _OPTIONS = (
     ("or another target", "or another --target"),
 )
 
+_SMALLER = (
+    "smaller --sft.batch-size, --world-model.batch-size, --post-train.minibatch-size or --post-train.groups take less; "
+    "a vision-language policy does in bfloat16 and with gradient_checkpointing"
+)
+
 
 def one_line_errors(main: Callable[P, int | None]) -> Callable[P, int]:
     """``main`` with :func:`expected` errors and warnings as lines on stderr; returns 1 after an error."""
@@ -62,10 +67,13 @@ def refusals() -> Iterator[None]:
 def expected(error: Exception) -> bool:
     """Whether an error is about settings, files or the machine, so that one line is enough: no programming error.
 
-    It is if a ``raise`` of this project made it, which knows what is wrong, or the system says it of a file or disk.
+    It is if a ``raise`` of this project made it, which knows what is wrong, or the system says it of a file or disk, or
+    a GPU's memory is full.
     The same ``ValueError`` out of a library, or of a line that raises nothing itself, is a mistake of the program.
     """
     if isinstance(error, OSError) and error.errno is not None and not isinstance(error, ConnectionError):
+        return True
+    if _out_of_memory(error):
         return True
     if not isinstance(error, ValueError | OSError | RuntimeError | ImportError):
         return False
@@ -94,6 +102,12 @@ def in_options(error: Exception) -> str:
     text = str(error)
     if isinstance(error, OSError) and error.strerror:
         text = error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
+    if _out_of_memory(error):
+        text = f"{text.split('. ')[0]}: {_SMALLER}"
     for argument, option in _OPTIONS:
         text = text.replace(argument, option)
     return " ".join(text.split())
+
+
+def _out_of_memory(error: Exception) -> bool:
+    return type(error).__name__ == "OutOfMemoryError"  # torch's, by name: commands that need no torch import none

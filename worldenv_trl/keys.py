@@ -27,6 +27,8 @@ NUM_STEPS = "num_steps"  # int64 [*B, 1], env steps executed since the reset
 
 ACTION = "action"  # float32 [*B, 7], one env action
 CHUNK = ("vla_action", "chunk")  # float32 [*B, C, 7], unclipped Laplace sample
+TOKENS = ("vla_action", "tokens")  # int64 [*B, C, 7], of policies that act by tokens
+LOGITS = ("vla_action", "logits")  # float [*B, C, 7, V], over the V tokens that an action's number can be
 LOC = ("vla_action", "loc")  # float32 [*B, C, 7]
 SCALE = ("vla_action", "scale")  # float32 [*B, C, 7], exp(log-scale)
 LOG_SCALE = ("vla_action", "log_scale")  # float32 [*B, C, 7], the scale head's raw output

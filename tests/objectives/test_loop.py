@@ -339,7 +339,7 @@ def test_entries_that_do_not_fit_are_named(change, message):
 
 
 def test_settings_that_cannot_work_are_named():
-    for kwargs in ({"clip_epsilon": 0.0}, {"clip_epsilon": (1.0, 0.1)}, {"ratio_level": "token"}, {"normalize": "x"}):
+    for kwargs in ({"clip_epsilon": 0.0}, {"clip_epsilon": (1.0, 0.1)}, {"ratio_level": "x"}, {"normalize": "x"}):
         with pytest.raises(ValueError, match=next(iter(kwargs))):
             LOOPLoss(make_actor(), **kwargs)
     with pytest.raises(ValueError, match="event_dims=0"):

@@ -13,6 +13,7 @@ import sys
 import zlib
 from pathlib import Path
 
+import huggingface_hub
 import numpy as np
 import pytest
 import torch
@@ -118,6 +119,15 @@ def test_adapters_and_a_saved_copy_keep_them(released, tmp_path):
     actions.sum().backward()
 
 
+def test_fine_tuning_on_other_data_keeps_the_bounds_that_the_heads_were_trained_with(released):
+    policy = load_openvla_oft(released, **SETTINGS)
+    policy.fit_statistics(torch.randn(50, 7), torch.randn(50, 7))
+    torch.testing.assert_close(policy(observations())[keys.LOC], expected(), rtol=0, atol=1e-4)
+    low, high = (torch.tensor(REFERENCE["statistics"]["libero_tiny_no_noops"]["action"][q]) for q in ("q01", "q99"))
+    torch.testing.assert_close(policy.action_range[:6], ((high - low) / 2)[:6])
+    assert policy.action_range[6] == 1  # the gripper goes from -1 to +1
+
+
 def test_in_bfloat16_they_are_close(released):
     policy = load_openvla_oft(released, **(SETTINGS | {"dtype": "bfloat16"}))
     assert policy.backbone.model.towers[0].pos_embed.dtype == torch.bfloat16
@@ -200,7 +210,7 @@ def swap_heads(folder: Path) -> None:
         (
             rewrite("config.json", lambda fields: fields.update(timm_model_ids=["vit"])),
             ValueError,
-            r"describes a openvla with \['vit'\]: only openvla with vit_large",
+            r"describes an openvla with \['vit'\]: only the one with vit_large",
         ),
     ],
 )
@@ -209,6 +219,34 @@ def test_what_is_wrong_with_a_folder_is_said_in_one_line(damaged, damage, error,
     with pytest.raises(error, match=message) as caught:
         load_openvla_oft(damaged, **SETTINGS)
     assert "\n" not in str(caught.value)
+
+
+def test_another_kind_of_checkpoint_is_named_with_what_reads_it(released, damaged):
+    with pytest.raises(ValueError, match="holds an OpenVLA checkpoint: what reads it is load_openvla_oft"):
+        HFPolicy.from_backbone(released)
+    for fields, message in (
+        ({"model_type": "llava"}, "a model of type 'llava': what reads it is HFPolicy.from_backbone"),
+        ({"class": "HFPolicy", "config": {}}, "a HFPolicy of worldenv_trl: what reads it is HFPolicy.from_pretrained"),
+        ({"type": "pi0", "input_features": {}}, "a LeRobot policy of type 'pi0': what reads it is LeRobot alone"),
+    ):
+        (damaged / "config.json").unlink()
+        (damaged / "config.json").write_text(json.dumps(fields))
+        with pytest.raises(ValueError, match=message):
+            load_openvla_oft(damaged, **SETTINGS)
+
+
+def test_a_repository_of_the_hub_is_read_like_a_folder(released, tmp_path, monkeypatch):
+    asked = []
+
+    def snapshot_download(repo_id: str, **options) -> str:
+        asked.append((repo_id, options["allow_patterns"]))
+        return str(released)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    actions = load_openvla_oft("someone/arm", **SETTINGS)(observations())[keys.LOC]
+    torch.testing.assert_close(actions, expected(), rtol=0, atol=1e-4)
+    assert asked == [("someone/arm", ["*.json", "*.safetensors", "*.pt"])]
 
 
 def test_an_unknown_statistics_key_is_answered_with_those_there_are(released):

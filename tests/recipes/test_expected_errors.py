@@ -55,6 +55,18 @@ def test_what_goes_wrong_in_the_program_keeps_its_traceback(mistake, tmp_path, m
         one_line_errors(mistake)()
 
 
+def test_a_full_gpu_is_answered_with_the_settings_that_take_less(capsys):
+    said = "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 23.5 GiB"
+
+    def full() -> None:
+        raise torch.OutOfMemoryError(said)
+
+    assert one_line_errors(full)() == 1
+    line = capsys.readouterr().err
+    assert line.startswith("error: CUDA out of memory: smaller --sft.batch-size") and line.count("\n") == 1
+    assert "gradient_checkpointing" in line
+
+
 def test_a_value_error_of_python_itself_inside_our_code_is_no_check():
     code = compile("first, second = (1, 2, 3)", world_env.__file__, "exec")  # a line of ours that raises nothing itself
     error = caught(lambda: exec(code, {}))

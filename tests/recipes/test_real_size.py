@@ -108,3 +108,20 @@ def test_a_bound_is_the_slower_of_arithmetic_and_memory():
     gpu = real_size.GPUS[0]
     assert gpu.bound(int(gpu.bf16_flops), 0) == 1.0
     assert gpu.bound(0, int(2 * gpu.bandwidth)) == 2.0
+
+
+@pytest.mark.parametrize(
+    ("name", "published", "without"),
+    [
+        # Of the model cards' safetensors; without the language-modelling head, unless it is the embeddings again.
+        ("policy-smolvlm-500m", 507_482_304, 49280 * 960),
+        ("policy-paligemma-3b", 2_923_466_480, 0),
+    ],
+)
+def test_backbones_have_the_sizes_that_were_published(name, published, without):
+    pytest.importorskip("transformers")
+    (row,) = real_size.chosen((name,))
+    with torch.device("meta"):
+        policy = row.make()
+    base = [p for label, p in policy.backbone.model.named_parameters() if "lora_" not in label]
+    assert sum(parameter.numel() for parameter in base) == published - without

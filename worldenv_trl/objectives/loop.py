@@ -18,7 +18,8 @@ from worldenv_trl import keys
 
 __all__ = ["LOOPLoss"]
 
-RATIO_LEVELS = ("step", "chunk", "dim")
+RATIO_LEVELS = ("step", "chunk", "dim", "token")
+_EACH = ("dim", "token")  # of policies that write numbers, and of those that write a token for each number
 NORMALIZATIONS = ("global", "episode")
 
 
@@ -50,7 +51,9 @@ class LOOPLoss(LossModule):
     Keyword Args:
         clip_epsilon: ``epsilon``, or ``(low, high)``.
         ratio_level: ``step`` (the paper); ``chunk``: one ratio for the executed steps of a chunk, counted once for each
-            of them; ``dim``: one for each action dimension, averaged (needs log-probs [*B, C, 7], ``event_dims=0``).
+            of them; ``dim``: one for each action dimension, averaged (needs log-probs [*B, C, 7], ``event_dims=0``);
+            ``token``: the same for a :class:`~worldenv_trl.policies.TokenActor`, whose tokens are the action:
+            ``set_keys(action=keys.TOKENS)``.
         normalize: ``global`` (the paper) weighs every step equally, ``episode`` every rollout. The latter reads
             ``total_steps`` and the number of rollouts ``num_rollouts`` [*B, 1], or counts both if decisions are
             ``[*rollouts, T]``, time last.
@@ -165,7 +168,7 @@ class LOOPLoss(LossModule):
         low, high = self.clip_epsilon
         gain = torch.minimum(ratio * advantage, ratio.clamp(1 - low, 1 + high) * advantage)  # World-Env Eq. 5
         gain = torch.where(mask, gain, 0.0)
-        if self.ratio_level == "dim":
+        if self.ratio_level in _EACH:
             gain = gain.mean(-1)
         loss = -(gain * self._weight(tensordict, steps, gain.dtype)).sum()
         return TensorDict({"loss_objective": loss} | self._diagnostics(log_ratio.detach(), mask))
@@ -177,7 +180,7 @@ class LOOPLoss(LossModule):
         Returns:
             ``ratio`` [*B, C], new over behaviour probability, and ``clipped`` bool [*B, C], whether the clip takes the
             gradient of that step away (a ratio that has left the interval in the direction of its advantage); 1 and
-            False where nothing was executed. Both [*B, C, 7] for ``ratio_level="dim"``.
+            False where nothing was executed. Both [*B, C, 7] for ``dim`` and ``token``.
         """
         tensordict = tensordict.copy()  # the actor writes into it
         log_ratio, mask, advantage = self._compared(tensordict, self._executed(tensordict))
@@ -204,7 +207,7 @@ class LOOPLoss(LossModule):
             raise ValueError(f"{names.advantage} must be {[*steps.shape[:-1], 1]}, got {list(advantage.shape)}")
 
         # Actions that were not executed must not reach the graph: 0 * NaN is NaN, also backwards.
-        chunk = torch.where(steps.unsqueeze(-1), chunk, 0.0)
+        chunk = torch.where(steps.unsqueeze(-1), chunk, torch.zeros_like(chunk))  # tokens stay whole numbers
         now = self._distribution(tensordict).log_prob(chunk)
         if now.shape != before.shape:
             raise ValueError(
@@ -228,13 +231,15 @@ class LOOPLoss(LossModule):
         return steps if mask is None else steps & mask.reshape(*steps.shape[:-1], 1)
 
     def _log_ratio(self, difference: Tensor, steps: Tensor, advantage: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Log-ratios, zero where nothing was executed, their mask and advantage: [*B, C], or [*B, C, 7] for ``dim``."""
+        """Log-ratios, zero where nothing was executed, their mask and advantage: [*B, C], or [*B, C, 7] one by one."""
         if difference.ndim not in (steps.ndim, steps.ndim + 1):
             raise ValueError(f"log-probs must be [*B, C] or [*B, C, 7], got {list(difference.shape)}: use event_dims=1")
         each = difference.ndim == steps.ndim + 1
-        if self.ratio_level == "dim":
+        if self.ratio_level in _EACH:
             if not each:
-                raise ValueError("ratio_level='dim' needs log-probs [*B, C, 7]: build the actor with event_dims=0")
+                raise ValueError(
+                    f"ratio_level={self.ratio_level!r} needs log-probs [*B, C, 7]: build the actor with event_dims=0"
+                )
             mask = steps.unsqueeze(-1).expand_as(difference)
             return torch.where(mask, difference, 0.0), mask, advantage.unsqueeze(-1)
         difference = torch.where(steps, difference.sum(-1) if each else difference, 0.0)

@@ -10,20 +10,24 @@ from worldenv_trl.policies.laplace import IndependentLaplace
 from worldenv_trl.policies.oft import OFTConfig, OFTPolicy
 from worldenv_trl.policies.openvla_oft import load_openvla_oft
 from worldenv_trl.policies.pairing import check_pairing
+from worldenv_trl.policies.token_actor import IndependentCategorical, TokenActor, token_actor
 
 __all__ = [
     "DeviceBridge",
     "HFConfig",
     "HFPolicy",
+    "IndependentCategorical",
     "IndependentLaplace",
     "LaplaceActor",
     "OFTConfig",
     "OFTPolicy",
     "Policy",
+    "TokenActor",
     "check_pairing",
     "laplace_actor",
     "likelihood_actor",
     "load_openvla_oft",
     "random_shift",
     "scale_bounds",
+    "token_actor",
 ]

@@ -61,6 +61,8 @@ class HFConfig:
         prompt_end: ids of tokens behind every prompt.
         proprio_format: of the proprioception that the backbone sees, ``state``, the env's 7 numbers, or ``libero``, 8
             numbers: the gripper's opening becomes the positions of LIBERO's two fingers (m).
+        fixed_statistics: keep the bounds of proprioception and actions that came with a checkpoint, whose heads were
+            trained with them: :meth:`HFPolicy.fit_statistics` then changes nothing.
         head_dim: width of both heads; that of the language model when 0.
         head_blocks: residual blocks of both heads.
         log_scale_init: the log-scale before training.
@@ -90,6 +92,7 @@ class HFConfig:
     readout_shift: int = 0
     prompt_end: tuple[int, ...] = ()
     proprio_format: str = "state"
+    fixed_statistics: bool = False
     head_dim: int = 0
     head_blocks: int = 2
     log_scale_init: float = -3.0
@@ -203,7 +206,8 @@ class HFPolicy(Policy, Pretrained):
 
         Args:
             folder: what transformers' ``save_pretrained`` of model and processor wrote: ``config.json``, safetensors,
-                ``tokenizer.json`` and, for mean and deviation of the images, ``preprocessor_config.json``.
+                ``tokenizer.json`` and, for mean and deviation of the images, ``preprocessor_config.json``; or
+                ``owner/name`` of a repository of the Hub that holds these.
 
         Keyword Args:
             device: of the parameters.
@@ -211,7 +215,8 @@ class HFPolicy(Policy, Pretrained):
 
         Raises:
             FileNotFoundError: if one of these files is missing.
-            ValueError: for a family that is not known, or settings that cannot be.
+            ValueError: for a family that is not known, another kind of checkpoint (what reads it is said), or settings
+                that cannot be.
         """
         from worldenv_trl.policies.hf_files import read_backbone
 
@@ -247,7 +252,7 @@ class HFPolicy(Policy, Pretrained):
         """Takes the bounds of proprioception and actions from data, [..., 7] each: the 1 % and 99 % quantiles.
 
         Half of an action's range is at least .005, and of a state's .05: a dimension which hardly moves is not blown up
-        into noise.
+        into noise. Nothing changes where the config has ``fixed_statistics``.
 
         Raises:
             ValueError: for no data, or numbers that are not finite.
@@ -259,6 +264,8 @@ class HFPolicy(Policy, Pretrained):
                 raise ValueError(f"{name} must hold at least one row and only finite numbers")
             low, high = torch.quantile(flat, torch.tensor([0.01, 0.99]).to(flat), dim=0)
             bounds.append(((low + high) / 2, ((high - low) / 2).clamp(min=floor)))
+        if self.config.fixed_statistics:
+            return
         (center, half), (action_center, action_half) = bounds
         self.state_low.copy_(center - half)
         self.state_high.copy_(center + half)
@@ -303,8 +310,10 @@ class HFPolicy(Policy, Pretrained):
     @classmethod
     def build(cls, config: HFConfig, folder: Path) -> Self:
         from tokenizers import Tokenizer
+        from transformers.initialization import no_init_weights
 
-        return cls(config, Tokenizer.from_file(str(folder / TOKENIZER_NAME)))
+        with no_init_weights():  # billions of random numbers take minutes
+            return cls(config, Tokenizer.from_file(str(folder / TOKENIZER_NAME)))
 
     def _inject_adapters(self) -> None:
         import peft  # imported where used: it takes seconds

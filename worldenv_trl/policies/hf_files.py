@@ -9,11 +9,48 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from worldenv_trl import hub
+
 if TYPE_CHECKING:
     from tokenizers import Tokenizer
     from transformers import PreTrainedModel
 
-__all__ = ["check_weights", "read_backbone", "read_json", "read_tokenizer"]
+__all__ = ["check_kind", "check_weights", "local_folder", "read_backbone", "read_json", "read_tokenizer"]
+
+
+def local_folder(name: str | os.PathLike, revision: str | None = None) -> Path:
+    """A folder, or that of a Hub repository's files in the cache on this machine, brought there if need be.
+
+    Raises:
+        FileNotFoundError: if the repository cannot be had.
+    """
+    if hub.is_repo_id(name):
+        return hub.download(str(name), ["*.json", "*.safetensors", "*.pt"], revision=revision)
+    return Path(name)
+
+
+def check_kind(fields: dict[str, Any], folder: Path, wanted: str) -> None:
+    """Refuses a config of another kind of checkpoint, with what reads that kind.
+
+    Args:
+        fields: of ``config.json``.
+        folder: where it is.
+        wanted: ``backbone``, transformers' own, or ``openvla``.
+
+    Raises:
+        ValueError: for another kind.
+    """
+    if "class" in fields and "config" in fields:
+        found, reader = f"a {fields['class']} of worldenv_trl", f"{fields['class']}.from_pretrained"
+    elif "model_type" not in fields and {"type", "input_features"} & set(fields):
+        found, reader = f"a LeRobot policy of type {fields.get('type')!r}", "LeRobot alone: it runs there, not here"
+    elif fields.get("model_type") == "openvla" and wanted != "openvla":
+        found, reader = "an OpenVLA checkpoint", "load_openvla_oft"
+    elif fields.get("model_type") != "openvla" and wanted == "openvla":
+        found, reader = f"a model of type {fields.get('model_type')!r}", "HFPolicy.from_backbone"
+    else:
+        return
+    raise ValueError(f"{folder} holds {found}: what reads it is {reader}")
 
 
 def read_backbone(
@@ -29,8 +66,10 @@ def read_backbone(
 
     from worldenv_trl.policies.hf_backbone import backbone_config
 
-    folder = Path(folder)
-    config = backbone_config(read_json(folder, "config.json"))
+    folder = local_folder(folder)
+    described = read_json(folder, "config.json")
+    check_kind(described, folder, "backbone")
+    config = backbone_config(described)
     check_weights(folder)
     fields: dict[str, Any] = {"backbone": config.to_dict()}
     if (folder / "preprocessor_config.json").exists():

@@ -13,7 +13,14 @@ import torch
 from torch import Tensor
 
 from worldenv_trl.policies.hf import HFConfig, HFPolicy
-from worldenv_trl.policies.hf_files import check_weights, convert_command, read_json, read_tokenizer
+from worldenv_trl.policies.hf_files import (
+    check_kind,
+    check_weights,
+    convert_command,
+    local_folder,
+    read_json,
+    read_tokenizer,
+)
 from worldenv_trl.policies.prismatic import PrismaticConfig, PrismaticModel, dinosiglip_towers
 
 __all__ = ["load_openvla_oft"]
@@ -43,7 +50,8 @@ def load_openvla_oft(
     Args:
         folder: with ``config.json``, the backbone's safetensors, ``action_head--*_checkpoint.safetensors`` and
             ``proprio_projector--*_checkpoint.safetensors`` (released as ``.pt``: a pickle, refused with the command
-            that converts it), ``dataset_statistics.json`` and ``tokenizer.json``.
+            that converts it), ``dataset_statistics.json`` and ``tokenizer.json``; or ``owner/name`` of a
+            repository of the Hub that holds these.
 
     Keyword Args:
         statistics: key of ``dataset_statistics.json``; the only one when None.
@@ -58,17 +66,18 @@ def load_openvla_oft(
         ValueError: for pickled weights, a statistics key that is not there, another number of cameras, or a checkpoint
             of another architecture.
     """
-    folder = Path(folder)
     if len(cameras) != num_images:
         raise ValueError(
             f"the checkpoint was trained with {num_images} cameras, got {len(cameras)} ({', '.join(cameras)}): name "
             f"{num_images}, or pass num_images={len(cameras)} if it was trained with that many"
         )
+    folder = local_folder(folder)
     described = read_json(folder, "config.json")
-    if described.get("timm_model_ids", [DINO, SIGLIP]) != [DINO, SIGLIP] or described.get("model_type") != "openvla":
+    check_kind(described, folder, "openvla")
+    if described.get("timm_model_ids", [DINO, SIGLIP]) != [DINO, SIGLIP]:
         raise ValueError(
-            f"{folder / 'config.json'} describes a {described.get('model_type')} with "
-            f"{described.get('timm_model_ids')}: only openvla with {DINO} and {SIGLIP} is known"
+            f"{folder / 'config.json'} describes an openvla with {described['timm_model_ids']}: only the one with "
+            f"{DINO} and {SIGLIP} is known"
         )
     bounds = _statistics(folder, statistics)
     weights, tokenizer = check_weights(folder), read_tokenizer(folder)
@@ -91,6 +100,7 @@ def load_openvla_oft(
         "chunk_length": 8,
         "proprio": "measured",
         "proprio_format": "libero",
+        "fixed_statistics": True,
         "resolution": side,
         "image_mean": (0.0, 0.0, 0.0),  # the towers have their own
         "image_std": (1.0, 1.0, 1.0),
