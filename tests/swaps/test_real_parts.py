@@ -1,4 +1,5 @@
-"""What users bring at full size, tiny: a LLaVA reflector and a diffusers world model through the one recipe."""
+"""What users bring at full size, tiny: a vision-language policy, a LLaVA reflector and a diffusers world model, through
+the one recipe."""
 
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ sys.path.extend(str(Path(__file__).parents[1] / name) for name in ("world_models
 
 from safetensors import safe_open
 from small_diffusion import SMALL
+from test_recipe import VISION_LANGUAGE
 from tiny_vlm import save_tiny_vlm
 
 from parts import COMPACT, Part, instructions
@@ -45,6 +47,7 @@ def test_the_whole_loop_runs_with_real_parts(tiny, capsys, monkeypatch, tmp_path
 
     parts = dataclasses.replace(
         COMPACT,
+        policy=VISION_LANGUAGE,
         world_model=Part(make_world_model, DiffusionWorldModel.from_pretrained),
         reflector=Part(make_reflector, VLMReflector.from_pretrained),
     )
