@@ -1,4 +1,4 @@
-"""Training one part in all processes: ``DistributedDataParallel`` for small ones, ``fully_shard`` (FSDP2) for large ones.
+"""Training one part in all processes: ``DistributedDataParallel`` for small parts, ``fully_shard`` (FSDP2) for large.
 
 Every process learns from its rows of the same batch; what they step with is the gradient of the whole batch. In one
 process it is the loss, its backward pass and nothing else.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import gc
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.distributed.device_mesh import init_device_mesh
-from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
+from torch.distributed.fsdp import fully_shard
 from torch.distributed.tensor import DTensor, distribute_tensor
 from torch.nn.parallel import DistributedDataParallel
 
@@ -25,7 +25,6 @@ from worldenv_trl.devices import device_of
 
 MODES = ("ddp", "fsdp")
 _UNIT = 2**20  # parameters from which a layer of a list is gathered and freed by itself
-_METHODS = ("training_loss",)  # by which parts are trained that are not called
 
 Loss = Callable[[TensorDictBase], TensorDictBase]
 
@@ -46,17 +45,16 @@ class DataParallel:
     """
 
     def __init__(self, part: nn.Module, make_loss: Callable[[Any], Loss], mode: str = "ddp") -> None:
-        self.part, self._size = part, processes.size()
-        self._trained = part
+        self.part, self._trained, self._size = part, part, processes.size()
+        self._call: Callable[[TensorDictBase], Any]
         if self._size == 1:
-            self._call: Loss = make_loss(part)
+            self._call = make_loss(part)
         elif mode == "ddp":
-            self._call = DistributedDataParallel(
-                _Objective(part, make_loss(part)), broadcast_buffers=False, find_unused_parameters=True
-            )
+            objective = _Objective(part, make_loss)
+            self._call = DistributedDataParallel(objective, broadcast_buffers=False, find_unused_parameters=True)
         else:
-            self._trained = _sharded(part)
-            self._call = make_loss(self._trained)
+            self._trained = copy.deepcopy(part)
+            self._call = _sharded(_Objective(self._trained, make_loss))
 
     def __call__(self, batch: TensorDictBase) -> Any:
         """What the loss makes of this process's rows."""
@@ -176,33 +174,29 @@ def _nothing(batch: TensorDictBase) -> TensorDictBase:
 
 
 class _Objective(nn.Module):
-    """A loss as a module whose only parameters are the part's, once."""
+    """A loss as a module whose only parameters are the part's, once, and whose outputs show their tensors."""
 
-    def __init__(self, part: nn.Module, loss: Loss) -> None:
+    def __init__(self, part: nn.Module, make_loss: Callable[[Any], Loss]) -> None:
         super().__init__()
-        self.part, self._loss = part, (loss,)
+        self.part, self._make_loss = part, make_loss
+        self._loss: tuple[Loss, ...] = ()  # no submodule
 
     def forward(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        if not self._loss:  # a functional loss keeps the parameters that it finds: whole ones, which FSDP lends here
+            self._loss = (self._make_loss(self.part),)
         return dict(self._loss[0](batch).items())
 
 
-def _sharded(part: nn.Module) -> nn.Module:
-    """A copy of the part of whose parameters each process holds a share; scalars, which cannot be shared, whole."""
-    part = copy.deepcopy(part)
-    kind = device_of(part).type
-    options: dict[str, Any] = {
-        "mesh": init_device_mesh(kind, (processes.size(),)),
-        "ignored_params": set(_scalars(part)),
-    }
-    for module in reversed(list(part.modules())):  # the inner ones first
+def _sharded(objective: _Objective) -> _Objective:
+    """Lets each process hold a share of the parameters; scalars, which cannot be shared, whole."""
+    mesh = init_device_mesh(device_of(objective).type, (processes.size(),))
+    options: dict[str, Any] = {"mesh": mesh, "ignored_params": set(_scalars(objective))}
+    for module in reversed(list(objective.modules())):  # the inner ones first
         for layer in module if isinstance(module, nn.ModuleList) else ():
             if sum(parameter.numel() for parameter in layer.parameters()) >= _UNIT:
                 fully_shard(layer, **options)
-    fully_shard(part, **options)
-    for name in _METHODS:
-        if hasattr(part, name):
-            register_fsdp_forward_method(part, name)
-    return part
+    fully_shard(objective, **options)
+    return objective
 
 
 def _scalars(part: nn.Module) -> list[nn.Parameter]:

@@ -65,8 +65,7 @@ def post_train(
 
     def make_loss(part: Policy) -> LOOPLoss:
         scored = actor if part is policy else exploring_actor(config, part, settings.scale_factor)
-        options = {"clip_epsilon": settings.clip_epsilon, "ratio_level": settings.ratio_level}
-        return LOOPLoss(scored, functional=False, **options)
+        return LOOPLoss(scored, clip_epsilon=settings.clip_epsilon, ratio_level=settings.ratio_level, functional=False)
 
     learner = DataParallel(policy, make_loss, config.parallel)
     groups = {name: learner.trained(parameters) for name, parameters in groups.items()}

@@ -82,7 +82,7 @@ def _train(
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
     )
-    state = {"policy": learner, "optimizer": WholeOptimizer(optimizer), "schedule": schedule}
+    state: dict[str, Any] = {"policy": learner, "optimizer": WholeOptimizer(optimizer), "schedule": schedule}
     progress = Resumable(run, name, steps, **state).bar(f"sft {name}")
     for step in progress:
         with processes.sharing():

@@ -126,9 +126,8 @@ def _backward(
         for name, value in zip(names, values, strict=True):
             weight = 1.0 if name == "loss_objective" else share
             figures[name] = figures.get(name, 0.0) + weight * value
-    return dict(
-        zip(figures, processes.total(torch.tensor([*figures.values()], dtype=torch.float64)).tolist(), strict=True)
-    )
+    sums = processes.total(torch.tensor([*figures.values()], dtype=torch.float64))
+    return dict(zip(figures, sums.tolist(), strict=True))
 
 
 def _part(decisions: TensorDictBase, rows: torch.Tensor) -> TensorDictBase:

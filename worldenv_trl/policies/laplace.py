@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import torch
 from torch.distributions import Independent, Laplace
+from torch.types import _size
 
 from worldenv_trl.row_share import own_rows
+
+_ONE = torch.Size()  # sample of each distribution
 
 
 class IndependentLaplace(Independent):
@@ -36,11 +39,11 @@ class IndependentLaplace(Independent):
         super().__init__(Laplace(loc, scale, validate_args=validate_args), event_dims, validate_args=validate_args)
 
     @torch.no_grad()
-    def sample(self, sample_shape: torch.Size = torch.Size()) -> torch.Tensor:  # noqa: B008 - as in torch
+    def sample(self, sample_shape: _size = _ONE) -> torch.Tensor:
         """See :meth:`rsample`; without a gradient."""
         return self.rsample(sample_shape)
 
-    def rsample(self, sample_shape: torch.Size = torch.Size()) -> torch.Tensor:  # noqa: B008 - as in torch
+    def rsample(self, sample_shape: _size = _ONE) -> torch.Tensor:
         """Reparametrised samples ``[*sample_shape, *B, C, A]``; of rows shared by processes see
         :func:`~worldenv_trl.row_share.row_share`."""
         loc, scale = self.base_dist.loc, self.base_dist.scale
