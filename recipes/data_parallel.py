@@ -51,9 +51,11 @@ class DataParallel:
             self._call = make_loss(part)
         elif mode == "ddp":
             objective = _Objective(part, make_loss)
-            self._call = DistributedDataParallel(objective, broadcast_buffers=False, find_unused_parameters=True)
+            self._call = DistributedDataParallel(objective, forward_sync_buffers=False, find_unused_parameters=True)
         else:
             self._trained = copy.deepcopy(part)
+            for parameter in self._trained.parameters():
+                parameter.data = parameter.data.contiguous()  # channels last cannot be shared
             self._call = _sharded(_Objective(self._trained, make_loss))
 
     def __call__(self, batch: TensorDictBase) -> Any:
@@ -193,7 +195,8 @@ def _sharded(objective: _Objective) -> _Objective:
     options: dict[str, Any] = {"mesh": mesh, "ignored_params": set(_scalars(objective))}
     for module in reversed(list(objective.modules())):  # the inner ones first
         for layer in module if isinstance(module, nn.ModuleList) else ():
-            if sum(parameter.numel() for parameter in layer.parameters()) >= _UNIT:
+            called = not isinstance(layer, nn.ModuleList | nn.ModuleDict)
+            if called and sum(parameter.numel() for parameter in layer.parameters()) >= _UNIT:
                 fully_shard(layer, **options)
     fully_shard(objective, **options)
     return objective

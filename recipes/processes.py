@@ -27,7 +27,7 @@ Rows = TypeVar("Rows", bound=TensorDictBase)
 
 TIMEOUT = timedelta(days=2)
 """Longer than any stage of the main process. torchrun ends the others as soon as one has failed."""
-_NEEDED = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
+NEEDED = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
 _alone = False
 
 
@@ -71,7 +71,7 @@ def join(device: str) -> str:
 
 def _problem(device: str) -> str | None:
     count = os.environ["WORLD_SIZE"]
-    missing = [name for name in _NEEDED if not os.environ.get(name)]
+    missing = [name for name in NEEDED if not os.environ.get(name)]
     if missing:
         return (
             f"WORLD_SIZE={count} asks for several processes, but {', '.join(missing)} is not set: start them with "
