@@ -72,7 +72,8 @@ def update(
     sums: dict[str, float] = {}
     count, stopped = 0, False
     for _ in range(settings.epochs):
-        for rows in torch.randperm(sum(counts)).split(settings.minibatch_size):
+        order = processes.agreed(torch.randperm(sum(counts)))  # also if a policy's dropout has drawn otherwise
+        for rows in order.split(settings.minibatch_size):
             shares = [rows[(rows >= end - own) & (rows < end)] - (end - own) for own, end in _ends(counts)]
             optimizer.zero_grad()
             # A minibatch stands for its share of the whole batch.

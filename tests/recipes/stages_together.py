@@ -15,9 +15,11 @@ import signal
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 import config
+import updates
 from data_parallel import DataParallel
 from post_train import post_train
 from stages import open_run, rerun
@@ -38,7 +40,7 @@ SETTINGS = dataclasses.replace(
     world_model=config.WorldModel(steps=20, batch_size=2, lr=5e-4),
     reflector=config.Reflector(encoder_steps=20, steps=20, batch_size=4),
     post_train=config.PostTrain(
-        iterations=5, groups=4, group_size=3, epochs=2, minibatch_size=12, probe_every=4, probe_contexts=2,
+        iterations=5, groups=4, group_size=9, epochs=2, minibatch_size=36, probe_every=4, probe_contexts=2,
         contexts="mixed",
     ),
     evaluate=config.Evaluate(episodes_per_task=2, num_envs=2),
@@ -51,7 +53,9 @@ def learn(run, **options) -> None:
     def returns_of(wave):
         return wave[keys.CHUNK][..., :3].mean((-1, -2, -3)) + wave["next", keys.STEP_MASK].float().mean((-1, -2))
 
-    post_train(run, **options, returns_of=returns_of)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(updates, "_PIXELS", 1)  # sixteen decisions at once: a share takes one turn or two
+        post_train(run, **options, returns_of=returns_of)
 
 
 def work(run: str, kind: str, settings: dict, kill: list[int] | None = None) -> None:

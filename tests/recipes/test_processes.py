@@ -110,10 +110,10 @@ def test_each_process_learns_from_half_the_rows(two):
     rows = {kind: [json.loads((two / kind / f"rows_{rank}.json").read_text()) for rank in range(2)] for kind in STAGES}
     assert rows["sft"] == [25 * [4]] * 2 and rows["train_world_model"] == [20 * [1]] * 2
     assert rows["train_reflector"] == [40 * [4]] * 2
-    # Four groups of three rollouts of two decisions make two minibatches of twelve, twice an iteration, for five.
+    # Two groups of nine rollouts of two decisions, twice an iteration, for five; one row for a turn without any.
     mine, other = rows["post_train"]
-    assert len(mine) == len(other) == 20 and sum(mine) == sum(other) == 120
-    assert {first + second for first, second in zip(mine, other, strict=True)} == {12}
+    assert len(mine) == len(other) > 20 and max(mine + other) == 16
+    assert all(360 <= sum(each) <= 360 + each.count(1) for each in (mine, other))
 
 
 def test_loop_in_the_physics_is_lived_by_one_and_learned_by_both(one, two, tmp_path):
@@ -122,29 +122,27 @@ def test_loop_in_the_physics_is_lived_by_one_and_learned_by_both(one, two, tmp_p
     assert furthest(weights(one, "post_train"), weights(alone, "post_train")) > 1e-4  # others than imagination's
     assert furthest(weights(alone, "post_train"), weights(two / "physics", "post_train")) < 1e-5
     rows = [json.loads((two / "physics" / f"rows_{rank}.json").read_text()) for rank in range(2)]
-    assert sum(rows[0]) == sum(rows[1]) == 48
+    assert all(144 <= sum(each) <= 144 + each.count(1) for each in rows)
 
 
 @pytest.mark.parametrize(
     ("kind", "update", "said"),
-    [("post_train", 13, "iterations continues after step 3 of 5"), ("sft", 22, "nll continues after step 1 of 5")],
+    [("post_train", 22, "iterations continues after step"), ("sft", 22, "nll continues after step 1 of 5")],
 )
-def test_two_processes_of_which_one_is_killed_continue_to_the_same_weights(one, tmp_path, kind, update, said):
+@pytest.mark.parametrize("two", ["ddp"], indirect=True)
+def test_two_processes_of_which_one_is_killed_continue_to_the_same_weights(one, two, tmp_path, kind, update, said):
     stage = STAGES[kind]
-    runs = {name: copy_of(one, tmp_path / name, stage) for name in ("straight", "broken")}
-    often = {"checkpoint_minutes": 0.0}
-    struck = torchrun([{"run": str(runs["broken"]), "kind": kind, "settings": often, "kill": [1, update]}])
-    assert struck.returncode and not (runs["broken"] / "checkpoints" / stage).exists()
-    left = runs["broken"] / "resume" / stage
-    shutil.copytree(left, tmp_path / "left")
-
-    with pytest.raises(SystemExit, match=rf"was saved by 2 processes, now 1: delete {left} to begin the stage anew"):
-        work(str(runs["broken"]), kind, often)
-    done = torchrun([{"run": str(run), "kind": kind, "settings": often} for run in runs.values()])
+    run, often = copy_of(one, tmp_path / "run", stage), {"checkpoint_minutes": 0.0}
+    struck = torchrun([{"run": str(run), "kind": kind, "settings": often, "kill": [1, update]}])
+    assert struck.returncode and not (run / "checkpoints" / stage).exists()
+    refused = rf"was saved by 2 processes, now 1: delete {run / 'resume' / stage} to begin the stage anew"
+    with pytest.raises(SystemExit, match=refused):
+        work(str(run), kind, often)
+    done = torchrun([{"run": str(run), "kind": kind, "settings": often}])
     assert done.returncode == 0, done.stderr[-4000:]
     assert f"{stage}: {said}" in done.stdout
-    assert furthest(weights(runs["straight"], stage), weights(runs["broken"], stage)) == 0.0
-    assert lines(runs["straight"], stage) == lines(runs["broken"], stage)
+    assert furthest(weights(two / kind, stage), weights(run, stage)) == 0.0
+    assert lines(two / kind, stage) == lines(run, stage)
 
 
 def test_what_cannot_be_shared_is_one_line_and_ends_both(one, tmp_path):
