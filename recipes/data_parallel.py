@@ -70,6 +70,11 @@ class DataParallel:
         mine = dict(self._trained.named_parameters())
         return [mine[names[parameter]] for parameter in parameters]
 
+    def on_exchange(self, hook: Callable[[Any, Any], Any]) -> None:
+        """Lets a communication hook of ``torch.distributed.algorithms`` exchange the gradients, of ``ddp`` alone."""
+        if isinstance(self._call, DistributedDataParallel):
+            self._call.register_comm_hook(None, hook)
+
     # ------------------------------------------------------------------------------------------------- backward
 
     def backward_mean(self, value: Tensor, weight: Tensor | float) -> Tensor:

@@ -26,7 +26,8 @@ def together(draw: Callable[[int], torch.Tensor], size: int = 3) -> torch.Tensor
 
 def test_rows_of_all_are_those_of_one():
     torch.manual_seed(0)
-    assert torch.equal(together(lambda _: own_rows(torch.rand, 2)), torch.rand(6))
+    expected = torch.rand(6)
+    assert torch.equal(together(lambda _: own_rows(torch.rand, 2)), expected)
 
 
 def test_items_are_shared_in_their_order():
