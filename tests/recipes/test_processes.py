@@ -24,7 +24,7 @@ STAGES = {"sft": "sft", "train_world_model": "world_model", "train_reflector": "
 PHYSICS = {"post_train": {"env": "tabletop", "iterations": 2, "probe_every": 0}}
 
 
-def torchrun(jobs: list[dict], seconds: float = 120.0) -> subprocess.CompletedProcess:
+def torchrun(jobs: list[dict], seconds: float = 400.0) -> subprocess.CompletedProcess:
     """Two processes that do these jobs."""
     root = Path(__file__).parents[2]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
