@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 from config import WorldEnvConfig
+from data_parallel import MODES
 from loggers import check_loggers
 from parts import COMPACT, Parts
 from physics import tabletop
 from worldenv_trl.devices import choose_device
 from worldenv_trl.reflectors import StopRule
 from worldenv_trl.scenes import load_task
+
+
+def check_shares(config: WorldEnvConfig, processes: int) -> None:
+    """Raises ``ValueError`` naming the setting that so many processes cannot share out equally."""
+    for name, value in (
+        ("sft.batch_size", config.sft.batch_size),
+        ("world_model.batch_size", config.world_model.batch_size),
+        ("reflector.batch_size", config.reflector.batch_size),
+        ("post_train.groups", config.post_train.groups),
+    ):
+        if value % processes:
+            raise ValueError(f"{name} must be a multiple of the {processes} processes that share it, got {value}")
 
 
 def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
@@ -31,6 +44,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         ("post_train.env", config.post_train.env, ("imagined", "tabletop")),
         ("post_train.contexts", config.post_train.contexts, ("uniform", "mixed")),
         ("post_train.ratio_level", config.post_train.ratio_level, ("step", "chunk")),
+        ("parallel", config.parallel, MODES),
     ):
         if value not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")

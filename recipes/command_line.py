@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import ParamSpec
 
 import worldenv_trl
+from processes import FailedElsewhere
 
 P = ParamSpec("P")
 
@@ -58,6 +59,8 @@ def refusals() -> Iterator[None]:
     """Turns :func:`expected` errors into ``SystemExit("error: ...")``."""
     try:
         yield
+    except FailedElsewhere as error:
+        raise SystemExit(1) from error
     except Exception as error:
         if not expected(error):
             raise

@@ -157,6 +157,8 @@ class WorldEnvConfig:
     device: str = "auto"
     """Of the models, imagination and every update: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one.
     The physics and the recordings stay on the CPU."""
+    parallel: str = "ddp"
+    """Of what torchrun's processes train together, in each a copy (``ddp``) or a share of the weights (``fsdp``)."""
     checkpoint_minutes: float = 2.0
     """Between two checkpoints of the running stage: at most so much is lost when it is killed."""
     logger: tuple[str, ...] = ()

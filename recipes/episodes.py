@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+import processes
 from run import Run
 from worldenv_trl import keys
 from worldenv_trl.data import Episodes, episodes_from_rollouts, fill_store, open_store
@@ -21,13 +22,14 @@ def demonstrations_and_exploration(run: Run, rounds: int) -> tuple[Episodes, Epi
     names = ["explore" + ("" if number == 1 else f"_{number}") for number in range(1, rounds + 1)]
     files += [run.folder.require_rollouts(name, "explore") for name in names]
     store = run.folder.path / "episodes"
-    try:
-        parts = open_store(store, files)
-    except FileNotFoundError:
-        parts = fill_store(store, files)
-    except ValueError as error:  # the recordings are the record: nothing is lost with a store
-        print(f"{str(error).split(': fill_store')[0]}: it is made anew from the recordings")
-        parts = fill_store(store, files)
+    with processes.main_first():
+        try:
+            parts = open_store(store, files)
+        except FileNotFoundError:
+            parts = fill_store(store, files)
+        except ValueError as error:  # the recordings are the record: nothing is lost with a store
+            print(f"{str(error).split(': fill_store')[0]}: it is made anew from the recordings")
+            parts = fill_store(store, files)
     return parts[0], Episodes.cat(parts[1:])
 
 

@@ -8,25 +8,27 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from imagination import Imagination, frames_aside
-from physics import exploring_actor, physics_waves_env, recording
+import processes
+from data_parallel import DataParallel, WholeOptimizer
+from physics import exploring_actor, recording
 from probes import probe, probed_iterations, warning
 from resumable import Resumable
 from run import Run
 from stages import run_alone
 from updates import PATIENCE, STUCK, rate_factor, ratios, stuck, update
+from waves import Waves
 from worldenv_trl import keys
-from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import ContextSampler, FramesAside
 from worldenv_trl.metrics import HonestyAlarm
 from worldenv_trl.objectives import LOOPLoss, rloo_advantage
-from worldenv_trl.policies import DeviceBridge, Policy, laplace_actor
+from worldenv_trl.policies import Policy, laplace_actor
 from worldenv_trl.record import RolloutWriter
 
 
@@ -58,22 +60,15 @@ def post_train(
     actor = exploring_actor(config, policy, settings.scale_factor)
 
     sampler = ContextSampler() if settings.contexts == "mixed" else None
-    shape = [settings.groups, settings.group_size]
-    if settings.env == "imagined":
-        imagination = Imagination.load(run, models)
-        env = imagination.env(run, shape, seed=run.seed(target, "env"), sampler=sampler)
-        judges = {"world_model": imagination.world_model, "reflector": imagination.reflector}
-    else:
-        imagination, judges = None, {}
-        env = physics_waves_env(config, *shape, seed=run.seed(target, "env"), sampler=sampler)
-    collector = GroupCollector(
-        env,
-        DeviceBridge(actor),
-        groups_per_batch=settings.groups,
-        total_groups=settings.iterations * settings.groups,
-        group_size=settings.group_size,
-    )
-    loss = LOOPLoss(actor, clip_epsilon=settings.clip_epsilon, ratio_level=settings.ratio_level, functional=False)
+    waves = Waves(run, target, models, actor, sampler)
+    imagination = waves.imagination
+
+    def make_loss(part: Policy) -> LOOPLoss:
+        scored = actor if part is policy else exploring_actor(config, part, settings.scale_factor)
+        return LOOPLoss(scored, clip_epsilon=settings.clip_epsilon, ratio_level=settings.ratio_level, functional=False)
+
+    learner = DataParallel(policy, make_loss, config.parallel)
+    groups = {name: learner.trained(parameters) for name, parameters in groups.items()}
     optimizer = torch.optim.AdamW(
         [
             {"params": parameters, "lr": settings.head_lr if name == "heads" else settings.lora_lr}
@@ -89,63 +84,67 @@ def post_train(
 
     probed, recorded = probed_iterations(settings), {0, settings.iterations - 1}
     alarm = HonestyAlarm(len(probed), false_alarm_rate=settings.false_alarm_rate) if probed and imagination else None
-    aside, counts = frames_aside(env), {"stuck": 0}
-    learning: dict[str, Any] = {"collector": collector, "optimizer": optimizer, "mean": mean, "alarm": alarm}
-    left = Resumable(run, "iterations", settings.iterations, counts=counts, **learning)
-    _record_next(left.step in recorded, collector, aside)
+    counts = {"stuck": 0}
+    learning: dict[str, Any] = {"collector": waves.collector, "optimizer": WholeOptimizer(optimizer)}
+    learning |= {"mean": mean, "alarm": alarm, "counts": counts}
+    left = Resumable(run, "iterations", settings.iterations, **learning)
+    learner.scatter()
+    waves.record_next(left.step in recorded)
     if watch is not None and not left.step:
-        watch(0, averaged)
-    waves, progress, started = iter(collector), left.bar(target, "it"), time.monotonic()
+        processes.on_main(lambda: watch(0, averaged))
+    collected, progress, started = iter(waves), left.bar(target, "it"), time.monotonic()
     for iteration in progress:
-        wave = next(waves)
+        wave, mine = next(collected)
         factor = rate_factor(iteration, settings)
         for group, rate in zip(optimizer.param_groups, full_rates, strict=True):
             group["lr"] = factor * rate
-        returns = returns_of(wave)  # [G, N]
+        returns = processes.gathered(returns_of(mine))  # [G, N], of all processes
         if sampler is not None:
-            sampler.update(wave[keys.CONTEXT_ID][:, 0, 0, 0], returns)
+            sampler.update(processes.gathered(mine[keys.CONTEXT_ID][:, 0, 0, 0]), returns)
         advantage = rloo_advantage(returns)
         if settings.standardize:
             advantage = advantage / advantage.std().clamp_min(1e-6)
-        wave[keys.ADVANTAGE] = advantage[..., None, None].expand(*wave.shape, 1)
+        mine[keys.ADVANTAGE] = _expanded(processes.own_rows_of(advantage), mine)
         about = {}
-        if iteration in recorded:  # of the weights that collected it
-            about = recording(config, env, target, {"policy": policy} | judges, iteration=iteration)
-        metrics = update(wave, policy.in_keys, loss, optimizer, list(groups.values()), settings)
+        if iteration in recorded and processes.is_main():  # of the weights that collected it
+            about = recording(config, waves.env, target, {"policy": policy} | waves.judges, iteration=iteration)
+        metrics = update(mine, policy.in_keys, learner, optimizer, list(groups.values()), settings)
+        learner.gather()
         counts["stuck"] = stuck(counts["stuck"], metrics)
-        if counts["stuck"] == PATIENCE:
+        if counts["stuck"] == PATIENCE and processes.is_main():
             progress.write(STUCK.format(target, iteration, PATIENCE, settings.max_kl))
         if about:
-            wave.update(ratios(wave, policy.in_keys, loss))
-            _write(run, f"{target}_{iteration:03d}", about, wave, aside)
+            if wave is not mine:
+                wave[keys.ADVANTAGE] = _expanded(advantage, wave)
+            wave.update(ratios(wave, policy.in_keys, make_loss(policy)))
+            _write(run, f"{target}_{iteration:03d}", about, wave, waves.aside)
         mean.update_parameters(policy)
-        collector.update_policy_weights_()
 
-        metrics |= _wave_metrics(wave, returns, config.tasks)
+        metrics |= _wave_metrics(mine, returns, config.tasks)
         if sampler is not None:
             metrics["contexts_seen"] = len(sampler)
         metrics["iteration_seconds"], started = time.monotonic() - started, time.monotonic()
         if iteration in probed:
-            metrics |= probe(run, mean_actor, imagination, alarm)
+            metrics |= processes.on_main(lambda: probe(run, mean_actor, imagination, alarm))
             metrics["probe_seconds"], started = time.monotonic() - started, time.monotonic()
-            if metrics.get("honesty_alarm"):
+            if metrics.get("honesty_alarm") and processes.is_main():
                 progress.write(warning(target, iteration, metrics))
         run.folder.log(target, step=iteration, **metrics)
         progress.set_postfix({k: f"{metrics[k]:.3f}" for k in ("return", "kl_approx", "real_success") if k in metrics})
-        del wave  # before the next one is collected
+        del wave, mine  # before the next ones are collected
         if watch is not None:
-            watch(iteration + 1, averaged)
+            processes.on_main(partial(watch, iteration + 1, averaged))
             started = time.monotonic()  # the next iteration's
-        _record_next(iteration + 1 in recorded, collector, aside)
-    collector.shutdown()
-    averaged.save_pretrained(run.folder.checkpoint(target))
+        waves.record_next(iteration + 1 in recorded)
+    waves.shutdown()
+    learner.close()
+    if processes.is_main():
+        averaged.save_pretrained(run.folder.checkpoint(target))
 
 
-def _record_next(yes: bool, collector: GroupCollector, aside: FramesAside | None) -> None:
-    """Waves carry what is learned from; those that are recorded carry all, and their frames go to disk."""
-    collector.exclude = () if yes else [("next", "observation")]
-    if aside is not None:
-        aside.keep = yes
+def _expanded(advantage: torch.Tensor, wave: TensorDictBase) -> torch.Tensor:
+    """Of rollouts [G, N], at each decision of theirs."""
+    return advantage[..., None, None].expand(*wave.shape, 1)
 
 
 def _write(run: Run, name: str, about: dict, wave: TensorDictBase, aside: FramesAside | None) -> None:
@@ -162,15 +161,17 @@ def _write(run: Run, name: str, about: dict, wave: TensorDictBase, aside: Frames
 
 
 def _wave_metrics(wave: TensorDictBase, returns: torch.Tensor, tasks: tuple[str, ...]) -> dict[str, float]:
+    """Of the waves of all processes."""
     mask = wave[keys.MASK]
-    ended = (wave["next", "terminated"].squeeze(-1) & mask).any(-1)
+    ended = processes.gathered((wave["next", "terminated"].squeeze(-1) & mask).any(-1))
+    steps = processes.gathered((wave["next", keys.STEP_MASK] & mask[..., None]).sum((-2, -1)))
     metrics = {
         "return": returns.mean().item(),
         "stopped": ended.float().mean().item(),
-        "steps": (wave["next", keys.STEP_MASK] & mask[..., None]).sum((-2, -1)).float().mean().item(),
+        "steps": steps.float().mean().item(),
         "degenerate_groups": (returns.std(-1) < 1e-3).float().mean().item(),
     }
-    number = wave[keys.TASK_ID][..., 0, 0][:, 0]
+    number = processes.gathered(wave[keys.TASK_ID][..., 0, 0][:, 0])
     for task in number.unique().tolist():
         metrics[f"stopped_{tasks[task]}"] = ended[number == task].float().mean().item()
     return metrics

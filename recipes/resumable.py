@@ -35,6 +35,7 @@ from torchrl.checkpoint import (
 )
 from tqdm import tqdm
 
+import processes
 from run import Run
 from worldenv_trl.memmap import check_room
 
@@ -60,6 +61,9 @@ class Resumable:
             NumPy, Python) and the stage's metrics are always saved. They are restored here, so that what is derived
             from them comes after.
 
+    Of several processes the main one writes, and decides when; all must come here alike. What the components say is
+    asked of all of them, so that they may put their states together; every process has random states of its own.
+
     Raises:
         NotResumable: if the newest whole checkpoint does not fit the components, or the number of processes.
     """
@@ -70,9 +74,11 @@ class Resumable:
         self._minutes = run.config.checkpoint_minutes if minutes is None else minutes
         self._noted: dict[str, Any] = {}
         self._checkpoint = Checkpoint(format="archive")  # a ZIP file: its checksums tell what is cut short
-        everything = components | {"random": GlobalRNGState(), "noted": self._noted}
+        everything = components | {"random": _RandomStates(), "noted": self._noted}
         for key, component in everything.items():
             if component is not None:
+                if processes.size() > 1 and hasattr(component, "load_state_dict"):
+                    component = _Asked(component)
                 keeps_state = hasattr(component, "load_state_dict")  # a buffer's own dump would write its frames, too
                 adapter = StateDictCheckpointAdapter("consolidated") if keeps_state else None
                 self._checkpoint.register(key, component, adapter=adapter)
@@ -91,10 +97,11 @@ class Resumable:
 
     def bar(self, label: str, unit: str = "step") -> tqdm:
         """The steps with a progress bar."""
-        return tqdm(self, desc=label, total=self.total, initial=self.step, unit=unit)
+        hidden = not processes.is_main()
+        return tqdm(self, desc=label, total=self.total, initial=self.step, unit=unit, disable=hidden)
 
     def _due(self) -> bool:
-        return time.monotonic() - self._saved_at >= 60 * self._minutes
+        return processes.agreed(time.monotonic() - self._saved_at >= 60 * self._minutes)
 
     # ------------------------------------------------------------------------------------------------- saving
 
@@ -102,6 +109,11 @@ class Resumable:
         """Saves what the next step depends on. A full disk costs a line on stderr and no more: the older checkpoints
         stay, and the next attempt comes when it is due."""
         if self._stage is None:
+            return
+        for component in self._checkpoint.components.values():
+            if isinstance(component, _Asked):
+                component.ask()
+        if not processes.is_main():
             return
         lines = [json.dumps(line) for line in self._folder.read_metrics(self._stage)]
         self._noted |= {"step": self.step, "seconds": self._folder.stage_seconds(), "metrics": lines}
@@ -111,7 +123,7 @@ class Resumable:
             states = [each.state_dict() for each in self._checkpoint.components.values() if hasattr(each, "state_dict")]
             # It is put together and then packed. Mapped files on a full disk would kill the process without a word.
             check_room(folder, 2 * _nbytes(states) + 2**20, "the checkpoint")
-            self._rotation.save(self._checkpoint, step=self.step, metadata={"world_size": _world_size()})
+            self._rotation.save(self._checkpoint, step=self.step, metadata={"world_size": processes.size()})
         except (OSError, RuntimeError) as error:
             said = f"warning: {self._stage}, {self.name}: no checkpoint after step {self.step} ({error})"
             tqdm.write(f"{said}; the run goes on, older checkpoints stay", file=sys.stderr)
@@ -120,37 +132,72 @@ class Resumable:
     # ------------------------------------------------------------------------------------------------- restoring
 
     def _restore(self, stage: str) -> None:
+        path = processes.on_main(self._newest)
+        if path is None:
+            return
+        self._load(path)
+        self._folder.restore_stage(stage, self._noted["seconds"], map(json.loads, self._noted["metrics"]))
+        self.step = self._noted["step"]
+        done = f"continues after step {self.step} of {self.total}"
+        if processes.is_main():
+            tqdm.write(f"{stage}: {self.name} {'was finished' if self.step == self.total else done}")
+
+    def _newest(self) -> Path | None:
+        """The newest whole checkpoint; what is left of others goes."""
         folder = self._rotation.directory
         for left in folder.glob(".*"):  # of a process that was killed while it saved
             shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink()
-        broken = []
+        broken, whole = [], None
         for path in sorted(folder.glob(f"{self._rotation.prefix}-{12 * '[0-9]'}.torchrl"), reverse=True):
             if _is_whole(path):
-                self._load(path)
-                self._folder.restore_stage(stage, self._noted["seconds"], map(json.loads, self._noted["metrics"]))
-                self.step = self._noted["step"]
-                done = f"continues after step {self.step} of {self.total}"
-                tqdm.write(f"{stage}: {self.name} {'was finished' if self.step == self.total else done}")
+                whole = path
                 break
             broken.append(path)
             tqdm.write(f"warning: {path} is cut short or damaged: the one before it is taken, if any", file=sys.stderr)
         for path in broken:  # a later step in its name would keep newer ones from being the newest
             path.unlink()
+        return whole
 
     def _load(self, path: Path) -> None:
         remedy = f"delete {path.parent} to begin the stage anew"
         manifest = Checkpoint.manifest(path)
-        processes = manifest["metadata"].get("world_size")
-        if processes != _world_size():
-            raise NotResumable(f"{path} was saved by {processes} processes, now {_world_size()}: {remedy}")
+        saved_by = manifest["metadata"].get("world_size")
+        if saved_by != processes.size():
+            raise NotResumable(f"{path} was saved by {saved_by} processes, now {processes.size()}: {remedy}")
         differ = sorted(set(manifest["components"]) ^ set(self._checkpoint.components))
-        if differ:
+        if differ and processes.is_main():  # another one may do without some
             raise NotResumable(f"{path} is of another loop: it differs in {', '.join(differ)}; {remedy}")
         try:
             self._checkpoint.load(path)
         except CheckpointError as error:
             said = " ".join(str(error).split())
             raise NotResumable(f"{path} is of other settings, parts or another release ({said}): {remedy}") from error
+
+
+class _Asked:
+    """A component whose state was asked for in all processes before the main one writes it."""
+
+    def __init__(self, component: Any) -> None:
+        self._component = component
+        self.load_state_dict = component.load_state_dict
+
+    def ask(self) -> None:
+        self._state = self._component.state_dict()
+
+    def state_dict(self) -> Any:
+        return self._state
+
+
+class _RandomStates:
+    """Random states of all processes; each takes up its own."""
+
+    def state_dict(self) -> dict[str, Any]:
+        states = processes.gathered_values(GlobalRNGState().state_dict())
+        return states[0] if len(states) == 1 else {f"process_{rank}": state for rank, state in enumerate(states)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        mine = state_dict if processes.size() == 1 else state_dict[f"process_{processes.rank()}"]
+        GlobalRNGState().load_state_dict(mine)
 
 
 def _is_whole(path: Path) -> bool:
@@ -169,8 +216,3 @@ def _nbytes(state: Any) -> int:
     if isinstance(state, Mapping):
         return sum(map(_nbytes, state.values()))
     return sum(map(_nbytes, state)) if isinstance(state, list | tuple) else 0
-
-
-def _world_size() -> int:
-    distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
-    return torch.distributed.get_world_size() if distributed else 1

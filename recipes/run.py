@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+import processes
 from config import WorldEnvConfig
 from parts import COMPACT, Parts
 from run_folder import RunFolder
@@ -37,7 +38,7 @@ class Run:
         Raises:
             ValueError: for one that does not exist.
         """
-        return choose_device(self.config.device)
+        return choose_device(processes.join(self.config.device))
 
     @cached_property
     def kinematics(self) -> ForwardKinematics:

@@ -23,12 +23,13 @@ from typing import Any
 
 import yaml
 
+import processes
 from folder_lock import FolderLock, lock_folder
 from loggers import Loggers
 from worldenv_trl.report import machine_versions
 
 MIN_FREE_GB = 1.0
-FREE = {"run_dir", "num_threads", "device", "checkpoint_minutes", "logger"}
+FREE = {"run_dir", "num_threads", "device", "parallel", "checkpoint_minutes", "logger"}
 """Settings of the machine at hand: a run may be continued with others. Only ``device`` changes noise and rounding."""
 
 
@@ -36,7 +37,8 @@ class RunFolder:
     """A resumable run on disk.
 
     A stage is finished when its marker exists; its outputs are written under their final names only when complete, so
-    a crash loses at most the running stage, which continues from its last checkpoint.
+    a crash loses at most the running stage, which continues from its last checkpoint. Of several processes the main one
+    alone writes: in the others nothing is logged or marked, and what would be written is left out.
 
     Attributes:
         running: the stage that this process is in, if any.
@@ -103,6 +105,8 @@ class RunFolder:
             BlockingIOError: if another process runs on the folder, naming it.
             OSError: if less than :data:`MIN_FREE_GB` is free on the disk.
         """
+        if not processes.is_main():
+            return
         new = _plain(dataclasses.asdict(config))
         self.path.mkdir(parents=True, exist_ok=True)
         self._lock = lock_folder(self.path)
@@ -157,6 +161,8 @@ class RunFolder:
 
     def forget(self, stage: str) -> None:
         """Lets a stage, finished or not, run again from its beginning."""
+        if not processes.is_main():
+            return
         shutil.rmtree(self.progress(stage), ignore_errors=True)
         (self.path / "stages" / stage).unlink(missing_ok=True)
 
@@ -167,14 +173,19 @@ class RunFolder:
         What an earlier attempt has logged goes; a finished one's checkpoints, too, so that it begins anew. Its loops
         bring back what belongs to the checkpoint from which they continue.
         """
-        if self.done(name):
-            self.forget(name)
-        shutil.rmtree(self.path / "scratch", ignore_errors=True)
+        if processes.is_main():
+            if self.done(name):
+                self.forget(name)
+            shutil.rmtree(self.path / "scratch", ignore_errors=True)
+        processes.barrier()
         outer = self.running, self._started, self._seconds
         self.running, self._started, since = name, time.monotonic(), time.time()
         self.restore_stage(name, 0.0, [])
         try:
             yield
+            processes.barrier()  # nobody reads or writes there any more
+            if not processes.is_main():
+                return
             seconds = self.stage_seconds()
             self.log(name, seconds=seconds)
             # Marked first: a crash in between leaves checkpoints that nobody reads.
@@ -193,11 +204,15 @@ class RunFolder:
     def restore_stage(self, name: str, seconds: float, lines: Iterable[dict[str, Any]]) -> None:
         """Sets what the running stage has taken before this process, and its lines in ``metrics.jsonl``."""
         self._seconds = seconds
+        if not processes.is_main():
+            return
         kept = [line for line in self.read_metrics() if line["stage"] != name]
         _write_atomically(self.metrics_path, "".join(json.dumps(line) + "\n" for line in [*kept, *lines]))
 
     def log(self, stage: str, **values: Any) -> None:
         """Appends one line to ``metrics.jsonl``, and gives its numbers to the loggers."""
+        if not processes.is_main():
+            return
         values = _plain(values)
         with self.metrics_path.open("a") as file:
             file.write(json.dumps({"stage": stage} | values) + "\n")
@@ -205,7 +220,7 @@ class RunFolder:
 
     def keep_traceback(self, error: BaseException) -> Path | None:
         """Writes ``error.txt``, the last traceback; None if the disk takes no more."""
-        path = self.path / "error.txt"
+        path = self.path / ("error.txt" if processes.is_main() else f"error_{processes.rank()}.txt")
         try:
             _write_atomically(path, "".join(traceback.format_exception(error)))
         except OSError:
@@ -218,6 +233,8 @@ class RunFolder:
         Raises:
             ValueError: naming a logger that cannot start.
         """
+        if not processes.is_main():
+            return
         settings = {key: str(value) for key, value in _flat(_plain(dataclasses.asdict(config))).items()}
         self.loggers = Loggers.open(config.logger, self.path, settings)
 

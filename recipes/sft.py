@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -14,6 +15,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.objectives import BCLoss
 
+import processes
+from data_parallel import DataParallel, WholeOptimizer
 from episodes import demonstrations
 from resumable import Resumable
 from run import Run
@@ -22,6 +25,7 @@ from worldenv_trl import keys
 from worldenv_trl.data import policy_samples
 from worldenv_trl.devices import to_device
 from worldenv_trl.policies import Policy, laplace_actor, likelihood_actor, random_shift
+from worldenv_trl.row_share import own_rows
 
 
 def fine_tune(run: Run) -> None:
@@ -34,16 +38,23 @@ def fine_tune(run: Run) -> None:
     scale = list(policy.scale_parameters())
     learning = [parameter for parameter in policy.parameters() if parameter.requires_grad]
     others = [parameter for parameter in learning if all(parameter is not each for each in scale)]
-    loss = _behaviour_cloning(laplace_actor(policy), loss_function="l1")
-    _train(policy, loss, samples, others, settings.steps, settings.lr, run, "l1")
+
+    def l1(part: Policy) -> BCLoss:
+        return _behaviour_cloning(laplace_actor(part), loss_function="l1")
+
+    _train(policy, l1, samples, others, settings.steps, settings.lr, run, "l1")
 
     # Only the scale moves from here on (World-Env section 4.1).
     policy.requires_grad_(False)
     for parameter in scale:
         parameter.requires_grad_(True)
-    loss = _behaviour_cloning(likelihood_actor(policy))
-    _train(policy, loss, samples, scale, settings.scale_steps, settings.scale_lr, run, "nll")
-    policy.save_pretrained(run.folder.checkpoint("sft"))
+
+    def nll(part: Policy) -> BCLoss:
+        return _behaviour_cloning(likelihood_actor(part))
+
+    _train(policy, nll, samples, scale, settings.scale_steps, settings.scale_lr, run, "nll")
+    if processes.is_main():
+        policy.save_pretrained(run.folder.checkpoint("sft"))
 
 
 def _behaviour_cloning(actor: TensorDictModuleBase, **options: Any) -> BCLoss:
@@ -56,7 +67,7 @@ def _behaviour_cloning(actor: TensorDictModuleBase, **options: Any) -> BCLoss:
 
 def _train(
     policy: Policy,
-    loss: BCLoss,
+    make_loss: Callable[[Policy], BCLoss],
     samples: TensorDictBase,
     parameters: list[torch.nn.Parameter],
     steps: int,
@@ -64,26 +75,31 @@ def _train(
     run: Run,
     name: str,
 ) -> None:
-    settings = run.config.sft
+    settings, learner = run.config.sft, DataParallel(policy, make_loss, run.config.parallel)
+    parameters, rows = learner.trained(parameters), settings.batch_size // processes.size()
     images = [keys.image_key(camera) for camera in settings.cameras or run.config.cameras]
     optimizer = torch.optim.AdamW(parameters, lr=lr, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
     )
-    progress = Resumable(run, name, steps, policy=policy, optimizer=optimizer, schedule=schedule).bar(f"sft {name}")
+    state: dict[str, Any] = {"policy": learner, "optimizer": WholeOptimizer(optimizer), "schedule": schedule}
+    progress = Resumable(run, name, steps, **state).bar(f"sft {name}")
     for step in progress:
-        batch = to_device(samples[torch.randint(len(samples), (settings.batch_size,))], run.device)
-        for image in images:
-            batch[image] = random_shift(batch[image], settings.shift_px)
-        value = loss(batch)["loss_bc"]
+        with processes.sharing():
+            chosen = own_rows(lambda count: torch.randint(len(samples), (count,)), rows)
+            batch = to_device(samples[chosen], run.device)
+            for image in images:
+                batch[image] = random_shift(batch[image], settings.shift_px)
+        out = learner(batch)
         optimizer.zero_grad()
-        value.backward()
+        value = learner.backward_mean(out["loss_bc"], (~batch[keys.ACTION_IS_PAD]).sum())
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
         schedule.step()
         if step % 50 == 0 or step == steps - 1:
             run.folder.log("sft", step=step, **{name: value.item()})
             progress.set_postfix(loss=f"{value.item():.4f}")
+    learner.close()
 
 
 if __name__ == "__main__":

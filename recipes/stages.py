@@ -15,7 +15,8 @@ from typing import Any
 import tyro
 from tqdm import tqdm
 
-from checks import check_config
+import processes
+from checks import check_config, check_shares
 from command_line import expected, in_options, refusals
 from config import PRESETS, WorldEnvConfig
 from parts import COMPACT, Parts
@@ -26,6 +27,10 @@ from worldenv_trl.scenes import load_task
 
 Work = Callable[..., None]
 """``work(run, **options)``: what a stage does."""
+
+
+SHARED = {"sft", "train_world_model", "train_reflector", "post_train"}
+"""Kinds of stages that all processes work on; the others are the main one's."""
 
 
 @dataclass(frozen=True)
@@ -113,16 +118,28 @@ def parse(arguments: Sequence[str], module: str = "__main__") -> WorldEnvConfig:
 def open_run(config: WorldEnvConfig, parts: Parts = COMPACT) -> Run:
     """The run of checked settings; what is wrong with them is said in one line."""
     with refusals():
-        check_config(config, parts)
+        processes.join(config.device)
         folder = RunFolder(config.run_dir)
-        folder.open(config, {task: load_task(task).digest for task in config.tasks})
-        folder.start_logging(config)
+        count = processes.size()
+        processes.on_main(lambda: _check_and_open(config, parts, folder, count))
     use_threads(config.num_threads)
     return Run(config, folder, parts)
 
 
+def _check_and_open(config: WorldEnvConfig, parts: Parts, folder: RunFolder, count: int) -> None:
+    check_config(config, parts)
+    check_shares(config, count)
+    folder.open(config, {task: load_task(task).digest for task in config.tasks})
+    folder.start_logging(config)
+
+
 def _finished(stage: Stage, folder: RunFolder) -> bool:
-    return folder.done(stage.name) and (folder.path / stage.makes).exists()
+    return processes.agreed(folder.done(stage.name) and (folder.path / stage.makes).exists())
+
+
+def _warn(message: Warning | str) -> None:
+    if processes.is_main():
+        tqdm.write(f"warning: {message}", file=sys.stderr)
 
 
 def _run(stage: Stage, work: Work, run: Run) -> None:
@@ -137,16 +154,25 @@ def _run(stage: Stage, work: Work, run: Run) -> None:
     before = signal.signal(signal.SIGINT, interrupt) if here else None
     try:
         with run.folder.stage(stage.name), warnings.catch_warnings():
-            warnings.showwarning = lambda message, *_: tqdm.write(f"warning: {message}", file=sys.stderr)
-            work(run, **stage.options)
+            warnings.showwarning = lambda message, *_: _warn(message)
+            if stage.kind in SHARED:
+                work(run, **stage.options)
+            else:
+                processes.on_main(lambda: work(run, **stage.options))
     except BaseException as error:
         if not interrupted.is_set():
+            if isinstance(error, processes.FailedElsewhere):
+                raise SystemExit(1) from error
             if not isinstance(error, Exception) or not expected(error):
                 raise
             kept = run.folder.keep_traceback(error)
+            if not processes.speaks_first():
+                raise SystemExit(1) from error
             where = "" if kept is None else f" (stage {stage.name}; where it was raised: {kept})"
             raise SystemExit(f"error: {in_options(error)}{where}") from error
         # Libraries may have turned the KeyboardInterrupt into an error of their own.
+        if not processes.is_main():
+            raise SystemExit(1) from error
         message = f"interrupted in stage {stage.name}: the same command continues"
         raise SystemExit(f"\n{message}, finished stages are kept") from error
     finally:

@@ -12,6 +12,8 @@ from typing import Any, cast
 
 import torch
 
+import processes
+from data_parallel import DataParallel, WholeOptimizer
 from episodes import demonstrations_and_exploration, split_by_context
 from resumable import Resumable
 from run import LATE, Run, write_rules
@@ -37,7 +39,8 @@ def train_reflector(run: Run, target: str = "reflector", models: str = "", round
 
         def imagine(episodes: Episodes, name: str) -> Episodes:
             label, folder, seed = f"{target} imagines {name}", f"{scratch}/{name}", run.seed(target, f"imagines {name}")
-            return imagine_episodes(world_model, episodes, run.kinematics, seed=seed, progress=label, folder=folder)
+            told = label if processes.is_main() else None
+            return imagine_episodes(world_model, episodes, run.kinematics, seed=seed, progress=told, folder=folder)
 
         episodes = [demonstrated, training]
         if len(chosen):
@@ -57,7 +60,8 @@ def train_reflector(run: Run, target: str = "reflector", models: str = "", round
             name: choose_rule(values, held_out["success"], held_out.alive, number, LATE[name])
             for name, values in scores.items()
         }
-    write_rules(cast(Pretrained, reflector).save_pretrained(run.folder.checkpoint(target)), rules)
+    if processes.is_main():
+        write_rules(cast(Pretrained, reflector).save_pretrained(run.folder.checkpoint(target)), rules)
     for name, values in scores.items():
         for task in ("all", *config.tasks):
             rows = torch.ones(len(held_out), dtype=torch.bool)
@@ -69,23 +73,25 @@ def train_reflector(run: Run, target: str = "reflector", models: str = "", round
 
 def learn(run: Run, reflector: Reflector, episodes: Episodes, target: str) -> None:
     """The reflector's lessons, one after the other; none for one that needs no training."""
-    loss = ReflectorLoss(reflector)
     for number, lesson in enumerate(reflector.train_on(episodes)):
-        optimizer = torch.optim.AdamW(lesson.parameters, lr=lesson.lr, weight_decay=lesson.weight_decay)
+        learner = DataParallel(reflector, ReflectorLoss, run.config.parallel)
+        own = learner.trained(lesson.parameters)
+        optimizer = torch.optim.AdamW(own, lr=lesson.lr, weight_decay=lesson.weight_decay)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, lesson.lr, total_steps=lesson.steps)
-        parts: dict[str, Any] = {"reflector": reflector, "optimizer": optimizer, "schedule": schedule}
+        parts: dict[str, Any] = {"reflector": learner, "optimizer": WholeOptimizer(optimizer), "schedule": schedule}
         left = Resumable(run, f"{number}_{lesson.name}", lesson.steps, **parts)
         for step in left.bar(f"{target} {lesson.name}"):
-            out = loss(lesson.sample())
+            batch = processes.own_share(lesson.sample())
+            out = learner(batch)
             optimizer.zero_grad()
-            out["loss_reflector"].backward()
+            value = learner.backward_mean(out["loss_reflector"], batch.numel())
             optimizer.step()
             schedule.step()
             if step % 50 == 0:
-                figures = {
-                    f"{lesson.name}_{name.removesuffix('_reflector')}": value.item() for name, value in out.items()
-                }
-                run.folder.log(target, step=step, **figures)
+                accuracy = processes.mean(out["accuracy"], batch.numel())
+                figures = {"loss": value.item(), "accuracy": accuracy.item()}
+                run.folder.log(target, step=step, **{f"{lesson.name}_{name}": each for name, each in figures.items()})
+        learner.close()
 
 
 def _log_figures(

@@ -12,6 +12,8 @@ from typing import Any
 
 import torch
 
+import processes
+from data_parallel import DataParallel, WholeOptimizer
 from episodes import demonstrations_and_exploration, split_by_context
 from resumable import Resumable
 from run import Run
@@ -38,29 +40,36 @@ def train_world_model(run: Run, target: str = "world_model", previous: str | Non
     parameters = [parameter for parameter in model.train().parameters() if parameter.requires_grad]
     if parameters:
         options = {"failure_share": settings.failure_share, "seed": run.seed(target, "windows")}
-        windows = window_buffer(training, run.kinematics, model, batch_size=settings.batch_size, **options)
+        rows = settings.batch_size // processes.size()
+        windows = window_buffer(training, run.kinematics, model, batch_size=rows, **options)
         _train(run, model, parameters, windows, steps, target)
-    model.eval().save_pretrained(run.folder.checkpoint(target))
-    figures = fidelity(run, model, held_out, run.seed(target, "fidelity"))
+    model.eval()
+    if processes.is_main():
+        model.save_pretrained(run.folder.checkpoint(target))
+    figures = processes.on_main(lambda: fidelity(run, model, held_out, run.seed(target, "fidelity")))
     run.folder.log(target, episodes=len(training), held_out=len(held_out), **figures)
 
 
 def _train(
     run: Run, model: WorldModel, parameters: list[torch.nn.Parameter], windows: WindowBuffer, steps: int, target: str
 ) -> None:
-    settings, loss = run.config.world_model, WorldModelLoss(model)
+    settings, learner = run.config.world_model, DataParallel(model, WorldModelLoss, run.config.parallel)
+    parameters = learner.trained(parameters)
     optimizer = torch.optim.AdamW(parameters, lr=settings.lr, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 100) * (0.02 + 0.49 * (1 + math.cos(math.pi * step / steps)))
     )
     shown: dict[str, Any] = {"loss": None}  # its running mean
-    parts: dict[str, Any] = {"model": model, "optimizer": optimizer, "schedule": schedule, "windows": windows}
+    parts: dict[str, Any] = {"model": learner, "optimizer": WholeOptimizer(optimizer)}
+    parts |= {"schedule": schedule, "windows": windows}
     left = Resumable(run, "steps", steps, shown=shown, **parts)
     progress, started, first = left.bar(target), time.monotonic(), left.step
     for step in progress:
-        value = loss(windows.sample())["loss_world_model"]
+        with processes.sharing():
+            batch = windows.sample()
+            out = learner(batch)
         optimizer.zero_grad()
-        value.backward()
+        value = learner.backward_mean(out["loss_world_model"], out.get("weight", batch.numel()))
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
         schedule.step()
@@ -69,6 +78,7 @@ def _train(
             speed = (step + 1 - first) / (time.monotonic() - started)
             run.folder.log(target, step=step, loss=shown["loss"], steps_per_second=speed)
             progress.set_postfix(loss=f"{shown['loss']:.4f}")
+    learner.close()
 
 
 def fidelity(run: Run, model: WorldModel, episodes: Episodes, seed: int) -> dict[str, float]:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 
+import processes
 from config import PostTrain
+from data_parallel import DataParallel
 from worldenv_trl import keys
 from worldenv_trl.devices import device_of, to_device
 from worldenv_trl.language import instructions_of
@@ -34,7 +37,7 @@ def rate_factor(iteration: int, settings: PostTrain) -> float:
 def update(
     wave: TensorDictBase,
     in_keys: Sequence[NestedKey],
-    loss: LOOPLoss,
+    learner: DataParallel,
     optimizer: torch.optim.Optimizer,
     parameter_groups: Sequence[list[torch.nn.Parameter]],
     settings: PostTrain,
@@ -42,32 +45,39 @@ def update(
     """K epochs of clipped updates on the decisions of a wave, stopped when the policy has moved too far.
 
     Args:
-        wave: [G, N, T] with advantages, on whatever device; what is learned from goes to the loss's, once.
+        wave: [G, N, T] with advantages, on whatever device; what is learned from goes to the policy's, once. Of several
+            processes each has groups of its own, and a minibatch is theirs together.
         in_keys: what the policy reads.
+        learner: of a :class:`LOOPLoss`, whose minibatches add up.
 
     Decisions without an advantage teach nothing and are left out, but count among Eq. 5's steps. If there is no other
     one, nothing moves: the optimiser's moments alone would.
     """
     mask = wave[keys.MASK]
     informative = mask & (wave[keys.ADVANTAGE].squeeze(-1) != 0)
-    if not informative.any():
+    counts = processes.gathered_values(int(informative.sum()))
+    if not any(counts):
         return {"updates": 0, "kl_stop": 0.0}
     learned = (keys.CHUNK, keys.LOG_PROBS, keys.ADVANTAGE, ("next", keys.STEP_MASK), keys.MASK)
+    chosen = informative.flatten()
+    if not counts[processes.rank()]:
+        chosen = torch.arange(1)  # there must be something to take the place of rows
     # Flat first: a mask that leaves a whole block of texts without one makes tensordict stumble over the empty stack.
-    decisions = wave.select(*in_keys, *learned).reshape(-1)[informative.flatten()]
-    decisions = to_device(decisions, device_of(loss))
+    decisions = wave.select(*in_keys, *learned).reshape(-1)[chosen]
+    decisions = to_device(decisions, device_of(learner.part))
     decisions[keys.STEP_MASK] = decisions["next", keys.STEP_MASK]
     decisions.set(keys.INSTRUCTION, row_texts(instructions_of(decisions)))  # cheap to index, minibatch by minibatch
     total_steps = (wave["next", keys.STEP_MASK] & mask.unsqueeze(-1)).sum().to(decisions[keys.CHUNK].device)
+    total_steps = processes.total(total_steps)
     sums: dict[str, float] = {}
     count, stopped = 0, False
     for _ in range(settings.epochs):
-        for rows in torch.randperm(len(decisions)).split(settings.minibatch_size):
-            batch = decisions[rows]
-            # A minibatch stands for its share of the whole batch.
-            batch["total_steps"] = (total_steps * len(rows) / len(decisions)).expand(len(rows), 1)
+        order = processes.agreed(torch.randperm(sum(counts)))  # also if a policy's dropout has drawn otherwise
+        for rows in order.split(settings.minibatch_size):
+            shares = [rows[(rows >= end - own) & (rows < end)] - (end - own) for own, end in _ends(counts)]
             optimizer.zero_grad()
-            figures = _backward(loss, batch)
+            # A minibatch stands for its share of the whole batch.
+            figures = _backward(learner, decisions, shares, total_steps * len(rows) / sum(counts))
             if figures["kl_approx"] > settings.max_kl:
                 stopped = True
                 break
@@ -82,21 +92,53 @@ def update(
     return {name: value / max(count, 1) for name, value in sums.items()} | {"updates": count, "kl_stop": float(stopped)}
 
 
-def _backward(loss: LOOPLoss, batch: TensorDictBase) -> dict[str, float]:
+def _ends(counts: Sequence[int]) -> list[tuple[int, int]]:
+    """How many decisions each process has, and where its own end among those of all."""
+    return list(zip(counts, itertools.accumulate(counts), strict=True))
+
+
+def _backward(
+    learner: DataParallel, decisions: TensorDictBase, shares: Sequence[torch.Tensor], total_steps: torch.Tensor
+) -> dict[str, float]:
     """Gradients and figures of a minibatch, so many rows at a time as fit: the losses of the parts add up to that of
-    the whole."""
-    pixels = sum(value[0].numel() for value in batch["observation"].values() if value.dtype == torch.uint8)
-    at_once = _PIXELS if batch[keys.CHUNK].device.type == "cpu" else _PIXELS_ON_GPU
-    steps, figures = batch[keys.STEP_MASK].sum(), dict[str, float]()
-    for part in batch.split(max(16, at_once // max(pixels, 1))):
-        out = loss(part)
-        out["loss_objective"].backward()
+    the whole.
+
+    Args:
+        learner: see :func:`update`.
+        decisions: [M], this process's.
+        shares: rows of the minibatch, of the decisions of each process.
+        total_steps: that the minibatch stands for.
+    """
+    pixels = sum(value[0].numel() for value in decisions["observation"].values() if value.dtype == torch.uint8)
+    at_once = max(16, (_PIXELS if decisions[keys.CHUNK].device.type == "cpu" else _PIXELS_ON_GPU) // max(pixels, 1))
+    parts = list(shares[processes.rank()].split(at_once))
+    # All take as many turns: gradients are exchanged in them.
+    turns = max(-(-len(share) // at_once) for share in shares)
+    mine = decisions[keys.STEP_MASK][shares[processes.rank()]].sum()
+    steps, figures = processes.total(mine), dict[str, float]()
+    for turn in range(turns):
+        part = _part(decisions, parts[turn] if turn < len(parts) else parts[0][:0])
+        part["total_steps"] = total_steps.expand(len(part), 1)
+        with learner.accumulating(last=turn + 1 == turns):
+            out = learner(part)
+            learner.backward_sum(out["loss_objective"])
         names = [name for name, value in out.items() if value.numel() == 1]
         share, *values = torch.stack([part[keys.STEP_MASK].sum() / steps, *(out[name] for name in names)]).tolist()
         for name, value in zip(names, values, strict=True):
             weight = 1.0 if name == "loss_objective" else share
             figures[name] = figures.get(name, 0.0) + weight * value
-    return figures
+    sums = processes.total(torch.tensor([*figures.values()], dtype=torch.float64))
+    return dict(zip(figures, sums.tolist(), strict=True))
+
+
+def _part(decisions: TensorDictBase, rows: torch.Tensor) -> TensorDictBase:
+    """Some rows of the decisions; where there is none, one that does not count."""
+    if len(rows):
+        return decisions[rows]
+    blank = decisions[:1].clone()
+    blank[keys.STEP_MASK] = torch.zeros_like(blank[keys.STEP_MASK])
+    blank["next", keys.STEP_MASK] = blank[keys.STEP_MASK]
+    return blank
 
 
 def ratios(wave: TensorDictBase, in_keys: Sequence[NestedKey], loss: LOOPLoss) -> TensorDictBase:

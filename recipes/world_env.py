@@ -15,6 +15,7 @@ from __future__ import annotations
 import sys
 from contextlib import closing
 
+import processes
 import report
 from config import WorldEnvConfig
 from demonstrate import demonstrate
@@ -43,11 +44,16 @@ WORKS: dict[str, Work] = {
 def run_all(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     """Runs what is not finished yet, then prints the table and writes the plots and the report."""
     run = open_run(config, parts)
-    with closing(run.folder.loggers) as loggers:
+    with closing(run.folder.loggers):
         run_stages(run, WORKS)
-        loggers.images(plot_run(run.folder.path))
-        summarize(run)
-        loggers.page(run.folder.path / "report.html")
+        processes.on_main(lambda: _conclude(run))
+
+
+def _conclude(run: Run) -> None:
+    loggers = run.folder.loggers
+    loggers.images(plot_run(run.folder.path))
+    summarize(run)
+    loggers.page(run.folder.path / "report.html")
 
 
 def summarize(run: Run) -> None:

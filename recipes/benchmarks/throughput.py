@@ -29,6 +29,7 @@ from torchrl.objectives import BCLoss
 
 from command_line import at_least, refusals
 from config import WorldEnvConfig
+from data_parallel import DataParallel
 from imagination import Imagination
 from parts import COMPACT
 from physics import exploring_actor, physics_waves_env, tabletop
@@ -207,6 +208,7 @@ def _loop(settings: Benchmark, run: Run, env: EnvBase, policy: Policy, timed: _T
     collector = GroupCollector(env, actor, groups_per_batch=settings.groups)
     collector.exclude = [("next", "observation")]
     loss = LOOPLoss(actor, clip_epsilon=learned.clip_epsilon, functional=False)
+    learner = DataParallel(policy, lambda _: loss)
     optimizer = torch.optim.AdamW([{"params": group} for group in groups.values()], lr=1e-6, weight_decay=0.0)
     waves: list[TensorDictBase] = []
     inside, updates = [], []
@@ -223,7 +225,7 @@ def _loop(settings: Benchmark, run: Run, env: EnvBase, policy: Policy, timed: _T
         imagine()
         (wave,) = waves
         wave[keys.ADVANTAGE] = rloo_advantage(wave["returns"][..., 0])[..., None, None].expand(*wave.shape, 1)
-        updates.append(update(wave, policy.in_keys, loss, optimizer, list(groups.values()), learned)["updates"])
+        updates.append(update(wave, policy.in_keys, learner, optimizer, list(groups.values()), learned)["updates"])
         return 1.0
 
     rows = settings.groups * settings.group_size

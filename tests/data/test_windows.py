@@ -10,6 +10,7 @@ from worldenv_trl import keys, memmap
 from worldenv_trl.data import Episodes, WindowBuffer, WindowSampler, predicted_poses, window_buffer
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.language import instructions_of
+from worldenv_trl.row_share import row_share
 from worldenv_trl.world_models import Window, request
 
 C = 4
@@ -285,3 +286,13 @@ def test_a_share_of_failures_needs_labels():
     unlabelled = Episodes(episodes.entries.exclude("success"), episodes.instructions, episodes.video[0])
     with pytest.raises(ValueError, match="no success labels"):
         window_buffer(unlabelled, FK, world_model(), failure_share=0.5)
+
+
+def test_processes_that_share_a_batch_draw_the_windows_of_one():
+    whole = drawn(make_buffer([9, 4], batch_size=6, seed=3), batches=2)
+    shares = []
+    for rank in range(3):
+        buffer = make_buffer([9, 4], batch_size=2, seed=3)
+        with row_share(rank, 3):
+            shares.append(drawn(buffer, batches=2).unflatten(0, (2, 2)))
+    assert torch.equal(torch.cat(shares, 1).flatten(0, 1), whole)

@@ -14,6 +14,7 @@ from torchrl.envs.transforms import Compose, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 
 from config import PostTrain
+from data_parallel import DataParallel
 from updates import ratios, update
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
@@ -79,7 +80,8 @@ def test_loop_updates_on_what_it_imagined_there(gpu, tmp_path):
     loss = LOOPLoss(actor, functional=False)
     optimizer = torch.optim.AdamW([{"params": group} for group in groups.values()], lr=1e-4)
     before = copy.deepcopy(policy.state_dict())
-    figures = update(wave, policy.in_keys, loss, optimizer, list(groups.values()), PostTrain(minibatch_size=4))
+    learner = DataParallel(policy, lambda _: loss)
+    figures = update(wave, policy.in_keys, learner, optimizer, list(groups.values()), PostTrain(minibatch_size=4))
     assert figures["updates"] > 0
     assert any(not torch.equal(value, before[name]) for name, value in policy.state_dict().items())
     wave.update(ratios(wave, policy.in_keys, loss))

@@ -28,6 +28,7 @@ from worldenv_trl.keys import (
     WRIST_IMAGE,
 )
 from worldenv_trl.record import read_rollouts, recorded
+from worldenv_trl.row_share import row_share
 from worldenv_trl.scenes import list_tasks
 
 FRAMES = keys.frames_key("agentview")
@@ -314,3 +315,19 @@ def test_a_recording_holds_the_noise_seeds_that_paint_its_frames_again(tmp_path)
         painted = world_model(asked)
         for key in (FRAMES, WRIST_FRAMES):
             assert torch.equal(painted[key], read[key][:, decision])
+
+
+def test_processes_that_share_the_groups_imagine_what_one_does():
+    whole_env = make_env(groups=4)
+    shares = [make_env(groups=2) for _ in range(2)]
+    for _ in range(3):  # from one pass over the contexts into the next
+        whole = whole_env.step(with_chunk(whole_env.reset()))
+        parts = []
+        for rank, env in enumerate(shares):
+            with row_share(rank, 2):
+                first = env.reset()
+            chunk = whole[CHUNK][2 * rank : 2 * rank + 2]
+            parts.append(env.step(first.set(CHUNK, chunk)))
+        assert torch.equal(torch.cat([part[CONTEXT_ID] for part in parts]), whole[CONTEXT_ID])
+        assert torch.equal(torch.cat([part["next", NOISE_SEED] for part in parts]), whole["next", NOISE_SEED])
+        assert torch.equal(torch.cat([part["next", FRAMES] for part in parts]), whole["next", FRAMES])

@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import probes
 import updates
 from config import PRESETS, PostTrain
+from data_parallel import DataParallel
 from parts import COMPACT
 from physics import exploring_actor
 from post_train import post_train
@@ -121,7 +122,8 @@ def test_an_iteration_without_an_informative_decision_moves_nothing():
     wave[keys.ADVANTAGE] = torch.tensor([1.0, -1.0]).view(1, 2, 1, 1).expand(1, 2, 3, 1).clone()
     wave["next", keys.STEP_MASK] = torch.ones(1, 2, 3, 8, dtype=torch.bool)
     wave[keys.MASK] = torch.ones(1, 2, 3, dtype=torch.bool)
-    last = (policy.in_keys, loss, optimizer, list(groups.values()), PostTrain(epochs=1, minibatch_size=6))
+    learner = DataParallel(policy, lambda _: loss)
+    last = (policy.in_keys, learner, optimizer, list(groups.values()), PostTrain(epochs=1, minibatch_size=6))
     assert update(wave, *last)["updates"] == 1  # now the optimiser has momentum
     before = copy.deepcopy(policy.state_dict())
     wave[keys.ADVANTAGE].zero_()
@@ -138,12 +140,13 @@ def test_a_minibatch_in_parts_gives_the_gradients_of_the_whole(monkeypatch):
         batch = actor(decisions(40))
     batch[keys.ADVANTAGE] = torch.randn(40, 1)
     batch[keys.STEP_MASK] = torch.rand(40, 8) < 0.7
-    batch["total_steps"] = batch[keys.STEP_MASK].sum().expand(40, 1)
+    batch["next", keys.STEP_MASK] = batch[keys.STEP_MASK]
+    learner, rows = DataParallel(policy, lambda _: loss), [torch.arange(40)]
     found = []
     for most in (10**9, 1):
         monkeypatch.setattr(updates, "_PIXELS", most)
         policy.zero_grad()
-        figures = updates._backward(loss, batch.clone())
+        figures = updates._backward(learner, batch.clone(), rows, batch[keys.STEP_MASK].sum())
         found.append((figures, [parameter.grad.clone() for parameter in policy.loc_head.parameters()]))
     (whole, gradients), (parts, summed) = found
     assert whole["loss_objective"] == pytest.approx(parts["loss_objective"], abs=1e-6)

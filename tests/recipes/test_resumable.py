@@ -187,7 +187,7 @@ def test_a_disk_without_room_is_noticed_before_anything_is_written(tmp_path, cap
 
 
 def test_a_checkpoint_of_another_loop_size_or_number_of_processes_is_refused(tmp_path, monkeypatch):
-    run = open_run(tmp_path / "run")
+    run, save = open_run(tmp_path / "run"), CheckpointRotation.save
 
     def loop(**parts):
         with run.folder.stage("sft"):
@@ -203,10 +203,14 @@ def test_a_checkpoint_of_another_loop_size_or_number_of_processes_is_refused(tmp
     with pytest.raises(NotResumable, match=r"size mismatch for weight.*to begin the stage anew") as refused:
         loop(model=torch.nn.Linear(3, 2))
     assert remedy in str(refused.value) and "\n" not in str(refused.value)
-    monkeypatch.setattr(resumable, "_world_size", lambda: 2)
-    with pytest.raises(NotResumable, match="was saved by 1 processes, now 2"):
-        loop(model=torch.nn.Linear(2, 2))
     assert len(checkpoints(run)) == 2
+    by_two = {"metadata": {"world_size": 2}}
+    monkeypatch.setattr(CheckpointRotation, "save", lambda *arguments, **options: save(*arguments, **options | by_two))
+    run.folder.forget("sft")
+    with pytest.raises(KeyboardInterrupt):
+        loop(model=torch.nn.Linear(2, 2))
+    with pytest.raises(NotResumable, match="was saved by 2 processes, now 1: delete"):
+        loop(model=torch.nn.Linear(2, 2))
 
 
 def test_loops_whose_names_begin_alike_keep_apart(tmp_path):

@@ -13,6 +13,7 @@ from tensordict import NonTensorStack, TensorDict
 
 from worldenv_trl.keys import frames_key, image_entry
 from worldenv_trl.language import instructions_of
+from worldenv_trl.row_share import row_share
 from worldenv_trl.world_models import VideoWorldModel
 from worldenv_trl.world_models.base import memory_key
 from worldenv_trl.world_models.cells import from_cells, to_cells, to_float
@@ -239,3 +240,20 @@ def test_instructions_without_a_calibration_are_warned_of_once():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model.training_loss(windows)
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_the_weighted_mean_of_shares_is_the_loss_of_the_whole_batch(deterministic):
+    model = make_model(ONE, deterministic=deterministic, unroll_prob=0.5)
+    windows = make_windows(model, starts=(0, 5, 3, 1))
+    losses = []
+    for size in (1, 2):
+        parts = []
+        for rank, share in enumerate(windows.tensor_split(size)):
+            torch.manual_seed(0)
+            with row_share(rank, size):
+                parts.append(model.training_loss(share))
+        weights = torch.stack([part["weight"] for part in parts])
+        values = torch.stack([part["loss_world_model"].detach() for part in parts])
+        losses.append(float((weights * values).sum() / weights.sum()))
+    assert losses[0] == pytest.approx(losses[1], abs=1e-6)

@@ -15,6 +15,7 @@ from worldenv_trl.data.episodes import Episodes
 from worldenv_trl.devices import device_of, to_device
 from worldenv_trl.keys import FRAMES, INSTRUCTION, TASK_ID
 from worldenv_trl.kinematics import ForwardKinematics
+from worldenv_trl.row_share import own_rows
 from worldenv_trl.row_texts import row_texts
 from worldenv_trl.world_models import WorldModel
 
@@ -96,9 +97,15 @@ class WindowSampler(Sampler):
     def sample(self, storage: Any, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Frames int64 [B, K] of ``batch_size`` windows, and what they are: ``episode`` and ``start`` [B], ``number``
         [B, K], the frames' numbers in their episode (past its end they show its last frame)."""
-        episode = torch.multinomial(self._weights, batch_size, replacement=True, generator=self._generator)
-        place = torch.rand(batch_size, generator=self._generator)
-        at_reset = torch.rand(batch_size, generator=self._generator) < self.reset_share
+
+        def episodes(count: int) -> Tensor:
+            return torch.multinomial(self._weights, count, replacement=True, generator=self._generator)
+
+        def uniform(count: int) -> Tensor:
+            return torch.rand(count, generator=self._generator)
+
+        episode, place = own_rows(episodes, batch_size), own_rows(uniform, batch_size)
+        at_reset = own_rows(uniform, batch_size) < self.reset_share
         start = torch.minimum((place * self._starts[episode]).long(), self._starts[episode] - 1)
         start = start.masked_fill(at_reset, 0)
         return self.window(episode, start)

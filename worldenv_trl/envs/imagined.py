@@ -36,6 +36,7 @@ from worldenv_trl.keys import (
 )
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.language import instructions_of
+from worldenv_trl.row_share import own_items
 from worldenv_trl.world_models import WorldModel, request
 from worldenv_trl.world_models.noise_seeds import noise_seeds
 
@@ -204,7 +205,7 @@ class ImaginedEnv(EnvBase):
             self._load(rows, *self._given(tensordict, rows))
             self._episode[rows] = 0
         else:
-            drawn = self._order.draw(len(whole))
+            drawn = own_items(self._order.draw, len(whole))
             index = torch.tensor(drawn, dtype=torch.int64).repeat_interleave(rollouts)
             fresh = torch.tensor(whole, dtype=torch.int64)[:, None] * rollouts + torch.arange(rollouts)
             text = [self._instructions[i] for i in index.tolist()]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from worldenv_trl.row_share import own_rows
+
 
 def random_shift(images: torch.Tensor, pixels: int = 2, generator: torch.Generator | None = None) -> torch.Tensor:
     """Shifts every image by its own random whole number of pixels; the border repeats the edge (DrQ, arXiv:2004.13649).
@@ -29,7 +31,9 @@ def random_shift(images: torch.Tensor, pixels: int = 2, generator: torch.Generat
         return images.clone()
     height, width = images.shape[-2:]
     flat = images.reshape(-1, *images.shape[-3:])
-    shift = torch.randint(-pixels, pixels + 1, (2, flat.shape[0], 1), generator=generator).to(images.device)
+    shift = own_rows(
+        lambda count: torch.randint(-pixels, pixels + 1, (2, count, 1), generator=generator), flat.shape[0], 1
+    ).to(images.device)
     # Clamped indices are the repeated border; gathering keeps uint8 as it is.
     rows = (torch.arange(height, device=images.device) + shift[0]).clamp(0, height - 1)  # [N, H]
     columns = (torch.arange(width, device=images.device) + shift[1]).clamp(0, width - 1)  # [N, W]

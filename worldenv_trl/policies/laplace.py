@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import torch
 from torch.distributions import Independent, Laplace
+from torch.types import _size
+
+from worldenv_trl.row_share import own_rows
+
+_ONE = torch.Size()  # sample of each distribution
 
 
 class IndependentLaplace(Independent):
@@ -32,6 +37,20 @@ class IndependentLaplace(Independent):
         validate_args: bool | None = False,
     ):
         super().__init__(Laplace(loc, scale, validate_args=validate_args), event_dims, validate_args=validate_args)
+
+    @torch.no_grad()
+    def sample(self, sample_shape: _size = _ONE) -> torch.Tensor:
+        """See :meth:`rsample`; without a gradient."""
+        return self.rsample(sample_shape)
+
+    def rsample(self, sample_shape: _size = _ONE) -> torch.Tensor:
+        """Reparametrised samples ``[*sample_shape, *B, C, A]``; of rows shared by processes see
+        :func:`~worldenv_trl.row_share.row_share`."""
+        loc, scale = self.base_dist.loc, self.base_dist.scale
+        if sample_shape or not loc.ndim:
+            return super().rsample(sample_shape)
+        unit = Laplace(torch.zeros_like(loc[:1]), torch.ones_like(loc[:1]))  # of one row
+        return loc + scale * own_rows(lambda count: unit.rsample(torch.Size([count])).squeeze(1), len(loc))
 
     @property
     def loc(self) -> torch.Tensor:

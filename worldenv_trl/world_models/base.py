@@ -107,7 +107,10 @@ class WorldModel(TensorDictModuleBase, abc.ABC):
 
     def training_loss(self, windows: TensorDictBase) -> TensorDict:
         """``loss_world_model`` (scalar) and detached figures, of windows as :func:`worldenv_trl.data.window_buffer`
-        draws them."""
+        draws them.
+
+        For training in several processes: ``weight``, the sum over which the loss is a mean (the number of windows when
+        absent), and random numbers of rows drawn through :func:`worldenv_trl.row_share.own_rows`."""
         raise TypeError(f"{type(self).__name__} is not trained: it has no training_loss")
 
 

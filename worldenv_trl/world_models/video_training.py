@@ -10,6 +10,7 @@ from torch import Tensor
 
 from worldenv_trl.keys import frames_key
 from worldenv_trl.language import instructions_of
+from worldenv_trl.row_share import own_rows
 from worldenv_trl.world_models.base import POSES, request
 from worldenv_trl.world_models.cells import from_cells, to_cells, to_float, to_uint8
 from worldenv_trl.world_models.flow_matching import add_noise
@@ -44,7 +45,7 @@ def video_loss(model: VideoWorldModel, windows: TensorDictBase) -> TensorDict:
 
     Returns:
         ``loss_world_model`` (scalar), and the detached ``mse`` and ``moving_mse`` (of images in [0, 1]) of the rows
-        without noise.
+        without noise, and ``weight``, that of all pixels, over which the loss is a mean.
 
     Raises:
         ValueError: for a window that is not a whole number of chunks.
@@ -57,7 +58,7 @@ def video_loss(model: VideoWorldModel, windows: TensorDictBase) -> TensorDict:
     if noise_prob is None:
         noise_prob = 0.0 if model.deterministic else 0.5
     count, device = len(windows), window.start.device
-    noised = torch.rand(count, device=device) < noise_prob
+    noised = _uniform(count, device) < noise_prob
     shown = window  # what the next chunk remembers: real frames, or the model's own
     reference = _stacked(model, window.recall(torch.zeros(count, 1, dtype=torch.int64, device=device)))
     total = weight = torch.zeros((), device=device)
@@ -69,10 +70,10 @@ def video_loss(model: VideoWorldModel, windows: TensorDictBase) -> TensorDict:
         asked = request(model, shown.recall, now, targets[POSES], window.actions[:, steps], texts)
         cells = _stacked(model, targets)  # [B, V, C, 3, P, h, w], the model's layout
         clean = to_float(cells)
-        level = torch.rand(count, device=device) * noised
+        level = _uniform(count, device) * noised
         noisy = None
         if noise_prob:
-            noisy = add_noise(clean, torch.randn_like(clean), level) * noised.view(-1, 1, 1, 1, 1, 1, 1)
+            noisy = add_noise(clean, _normal_like(clean), level) * noised.view(-1, 1, 1, 1, 1, 1, 1)
         predicted = model.predict(noisy, level, model.conditions(asked, texts))
 
         last = _stacked(model, window.recall(now.unsqueeze(-1)))
@@ -88,7 +89,7 @@ def video_loss(model: VideoWorldModel, windows: TensorDictBase) -> TensorDict:
 
         if (chunk + 1) * length < window.steps:
             painted = from_cells(to_uint8(predicted.detach()), config.patch)  # as imagination would store them
-            own = torch.rand(count, device=device) < config.unroll_prob
+            own = _uniform(count, device) < config.unroll_prob
             # A prediction from an almost clean chunk is not what the model would imagine.
             own = own & (level < 0.5)
             frames = {frames_key(camera): painted[:, index] for index, camera in enumerate(model.cameras)}
@@ -98,8 +99,17 @@ def video_loss(model: VideoWorldModel, windows: TensorDictBase) -> TensorDict:
             "loss_world_model": total / weight.clamp(min=1.0),
             "mse": sums[0] / sums[1].clamp(min=1.0),
             "moving_mse": sums[2] / sums[3].clamp(min=1.0),
+            "weight": weight.detach(),
         }
     )
+
+
+def _uniform(count: int, device: torch.device) -> Tensor:
+    return own_rows(lambda rows: torch.rand(rows, device=device), count)
+
+
+def _normal_like(clean: Tensor) -> Tensor:
+    return own_rows(lambda rows: torch.randn(rows, *clean.shape[1:], device=clean.device), len(clean))
 
 
 def _stacked(model: VideoWorldModel, frames: TensorDictBase) -> Tensor:

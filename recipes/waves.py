@@ -1,0 +1,112 @@
+"""LOOP's waves: groups of rollouts, whole ones in each process.
+
+In imagination every process rolls out its groups; the physics is the main one's, which deals the groups out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+
+import processes
+from imagination import Imagination, frames_aside
+from physics import physics_waves_env
+from run import Run
+from worldenv_trl import keys
+from worldenv_trl.collectors import GroupCollector
+from worldenv_trl.envs import ContextSampler, FramesAside
+from worldenv_trl.policies import DeviceBridge, LaplaceActor
+
+_LEARNED_FROM = (
+    keys.CHUNK,
+    keys.LOG_PROBS,
+    keys.MASK,
+    keys.TASK_ID,
+    keys.CONTEXT_ID,
+    "returns",
+    ("next", keys.STEP_MASK),
+    ("next", "terminated"),
+)
+
+
+class Waves:
+    """The waves of a post-training run, one an iteration.
+
+    Attributes:
+        env: in which this process collects; None where another one does.
+        collector: as above.
+        imagination: what is learned in; None for the physics.
+        judges: the parts that give a rollout its return, by name.
+    """
+
+    env: EnvBase | None = None
+    collector: GroupCollector | None = None
+    imagination: Imagination | None = None
+
+    def __init__(self, run: Run, target: str, models: str, actor: LaplaceActor, sampler: ContextSampler | None) -> None:
+        settings = run.config.post_train
+        self._groups, self._read = settings.groups // processes.size(), [*actor.policy.in_keys, *_LEARNED_FROM]
+        options: dict[str, Any] = {"seed": run.seed(target, "env"), "sampler": sampler}
+        self.judges: dict[str, Any] = {}
+        if settings.env == "imagined":
+            self.imagination = Imagination.load(run, models)
+            self.env = self.imagination.env(run, [self._groups, settings.group_size], **options)
+            self.judges = {"world_model": self.imagination.world_model, "reflector": self.imagination.reflector}
+            mine = self._groups
+        elif processes.is_main():
+            self.env = physics_waves_env(run.config, settings.groups, settings.group_size, **options)
+            mine = settings.groups
+        if self.env is not None:
+            self.collector = GroupCollector(
+                self.env,
+                DeviceBridge(actor),
+                groups_per_batch=mine,
+                total_groups=settings.iterations * mine,
+                group_size=settings.group_size,
+            )
+
+    @property
+    def aside(self) -> FramesAside | None:
+        """Where the frames of a wave that is recorded are kept."""
+        return None if self.env is None else frames_aside(self.env)
+
+    def record_next(self, yes: bool) -> None:
+        """Waves carry what is learned from; those that are recorded carry all, and their frames go to disk. The main
+        process records, of imagination the groups that it rolled out."""
+        if self.collector is None or self.env is None:
+            return
+        self.collector.exclude = () if yes else [("next", "observation")]
+        if self.aside is not None:
+            self.aside.keep = yes and processes.is_main()
+
+    def __iter__(self) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
+        """``(wave, mine)``: what this process collected, and its groups [G, N, T] of the wave of all; mostly the same.
+
+        All go on with the same random numbers: where one process that had collected all groups would be.
+        """
+        collected = iter(()) if self.collector is None else iter(self.collector)
+        while True:
+            if self.imagination is None and processes.size() > 1:
+                yield self._dealt(collected)
+                continue
+            with processes.sharing():
+                wave = next(collected, None)
+            if wave is None:
+                return
+            decisions = processes.gathered_values(wave.shape[-1])
+            processes.same_random_state(decisions.index(max(decisions)))
+            yield wave, wave
+
+    def _dealt(self, collected: Iterator[TensorDictBase]) -> tuple[TensorDictBase, TensorDictBase]:
+        lived: list[TensorDictBase] = []
+        processes.on_main(lambda: lived.append(next(collected)))
+        parts = [part.clone() for wave in lived for part in wave.select(*self._read, strict=False).split(self._groups)]
+        mine = processes.dealt(parts)
+        return (lived[0] if lived else mine), mine
+
+    def shutdown(self) -> None:
+        if self.collector is not None:
+            self.collector.shutdown()

@@ -1,0 +1,88 @@
+"""What a process of torchrun does in the tests: stages, one after the other, each on a folder of its own.
+
+    torchrun --nproc-per-node 2 tests/recipes/stages_together.py JOBS
+
+JOBS is a JSON list of ``{"run": folder, "kind": of the stage, "settings": {...}, "kill": [rank, update]}``. What each
+process learned from goes to ``rows_<rank>.json`` in the folder.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import config
+import updates
+from data_parallel import DataParallel
+from post_train import post_train
+from stages import open_run, rerun
+from world_env import WORKS
+from worldenv_trl import keys
+
+SETTINGS = dataclasses.replace(
+    config.PRESETS["smoke"][1],
+    device="cpu",
+    checkpoint_minutes=1000.0,
+    num_threads=1,
+    tasks=config.GOAL_TASKS[1:2],
+    max_steps=16,
+    train_states=4,
+    demonstrate=config.Demonstrate(episodes_per_task=1),
+    sft=config.SFT(steps=20, scale_steps=5, batch_size=8),
+    explore=config.Explore(episodes_per_task=8, num_envs=4, scale_factors=(1.0,)),
+    world_model=config.WorldModel(steps=20, batch_size=2, lr=5e-4),
+    reflector=config.Reflector(encoder_steps=20, steps=20, batch_size=4),
+    post_train=config.PostTrain(
+        iterations=5, groups=4, group_size=9, epochs=2, minibatch_size=36, probe_every=4, probe_contexts=2,
+        contexts="mixed",
+    ),
+    evaluate=config.Evaluate(episodes_per_task=2, num_envs=2),
+)  # fmt: skip
+
+
+def learn(run, **options) -> None:
+    """LOOP on returns that differ by more than rounding, which an untrained reflector's do not."""
+
+    def returns_of(wave):
+        return wave[keys.CHUNK][..., :3].mean((-1, -2, -3)) + wave["next", keys.STEP_MASK].float().mean((-1, -2))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(updates, "_PIXELS", 1)  # sixteen decisions at once: a share takes one turn or two
+        post_train(run, **options, returns_of=returns_of)
+
+
+def work(run: str, kind: str, settings: dict, kill: list[int] | None = None) -> None:
+    rows, call, step = [], DataParallel.__call__, torch.optim.AdamW.step
+
+    def counted(self, batch):
+        rows.append(len(batch))
+        return call(self, batch)
+
+    def killed(self, *arguments):
+        if len(rows) == kill[1] and int(os.environ["RANK"]) == kill[0]:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return step(self, *arguments)
+
+    DataParallel.__call__ = counted
+    if kill is not None:
+        torch.optim.AdamW.step = killed
+    try:
+        changed = {name: dataclasses.replace(getattr(SETTINGS, name), **value) if isinstance(value, dict) else value
+                   for name, value in settings.items()}  # fmt: skip
+        opened = open_run(dataclasses.replace(SETTINGS, run_dir=Path(run), **changed))
+        rerun(kind, (WORKS | {"post_train": learn})[kind], opened)
+        (Path(run) / f"rows_{os.environ.get('RANK', 0)}.json").write_text(json.dumps(rows))
+    finally:
+        DataParallel.__call__, torch.optim.AdamW.step = call, step
+
+
+if __name__ == "__main__":
+    for job in json.loads(sys.argv[1]):
+        work(**job)
