@@ -174,6 +174,7 @@ class ImaginedEnv(EnvBase):
         self._seed = int(torch.randint(2**31, ()).item()) if seed is None else int(seed)
         self._order.seed(self._seed)
         self._resets.zero_()
+        self._starts: TensorDictBase | None = None  # of the next reset of all rows, if they were given
 
     # ------------------------------------------------------------------------------------------------- reset
 
@@ -187,6 +188,27 @@ class ImaginedEnv(EnvBase):
         self._order.load_state_dict(state["order"])
         self._resets.copy_(state["resets"])
 
+    def draw_starts(self) -> TensorDict:
+        """Draws what the next reset of all rows would begin with, and counts as that reset; nothing is loaded.
+
+        Returns:
+            TensorDict ``[G, N]``: ``place`` int64 in the contexts [K], and ``episode`` int64, by which the noise of a
+            row's rollouts differs. An env of the same contexts takes them, or those of some groups:
+            :meth:`begin_with`.
+        """
+        groups, rollouts = self.batch_size
+        self._resets += 1
+        place = torch.tensor(self._order.draw(groups), dtype=torch.int64).repeat_interleave(rollouts)
+        starts = {"place": place.view(groups, rollouts), "episode": self._resets.cpu().view(groups, rollouts).clone()}
+        return TensorDict(starts, self.batch_size)
+
+    def begin_with(self, starts: TensorDictBase) -> None:
+        """Lets the next reset of all rows begin with ``starts [G, N]``, of this env or another's :meth:`draw_starts`.
+        Groups are whole: a rollout's number in its group decides on its noise."""
+        if starts.batch_size != self.batch_size:
+            raise ValueError(f"starts must be {list(self.batch_size)}, got {list(starts.batch_size)}")
+        self._starts = starts
+
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
         groups, rollouts = self.batch_size
         mask = tensordict.get("_reset", None) if tensordict is not None else None
@@ -197,15 +219,23 @@ class ImaginedEnv(EnvBase):
         whole = [group for group in range(groups) if full[group] or not self._begun[group]]
         mask[whole] = True
         rows = mask.flatten().nonzero().squeeze(-1)
-        self._resets[rows] += 1
+        starts, self._starts = self._starts, None
+        if set_state or len(whole) < groups:
+            starts = None
+            self._resets[rows] += 1
+        else:
+            starts = self.draw_starts() if starts is None else starts
+            self._resets.copy_(starts["episode"].flatten())
         self._steps[rows] = 0
         self._decisions[rows] = 0
         if set_state:
             self._load(rows, *self._given(tensordict, rows))
             self._episode[rows] = 0
         else:
-            drawn = self._order.draw(len(whole))
-            index = torch.tensor(drawn, dtype=torch.int64).repeat_interleave(rollouts)
+            if starts is None:
+                index = torch.tensor(self._order.draw(len(whole)), dtype=torch.int64).repeat_interleave(rollouts)
+            else:
+                index = starts["place"].flatten()
             fresh = torch.tensor(whole, dtype=torch.int64)[:, None] * rollouts + torch.arange(rollouts)
             text = [self._instructions[i] for i in index.tolist()]
             self._load(fresh.flatten().to(self.device), self._contexts[index.to(self._contexts.device)], text)

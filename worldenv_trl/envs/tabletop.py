@@ -217,6 +217,7 @@ class TabletopEnv(EnvBase):
             check_whole("seed", seed, 0)
         self._seed = int(torch.randint(2**31, ()).item()) if seed is None else int(seed)
         self._episode = np.full(self.num_envs, -1)
+        self._starts: TensorDictBase | None = None  # of the next reset of all rows, if they were given
         for block in self._blocks:
             block.starts.seed(self._seed)
 
@@ -230,6 +231,35 @@ class TabletopEnv(EnvBase):
         self._seed, self._episode = state["seed"], state["episode"].numpy().copy()
         for block, starts in zip(self._blocks, state["starts"], strict=True):
             block.starts.load_state_dict(starts)
+
+    def draw_starts(self) -> TensorDict:
+        """Draws what the next reset of all rows would begin with, and counts as that reset; nothing is simulated.
+
+        Returns:
+            TensorDict ``[num_envs]``: ``place`` int64, which of its task's initial states a row starts from, and
+            ``episode`` int64, its number. An env of the same tasks and states takes them, or those of some groups
+            that begin at a multiple of :attr:`groups_per_deal`: :meth:`begin_with`.
+        """
+        self._episode[:] = self._episode.max(initial=-1) + 1  # rows reset together stay in step: groups share states
+        place = np.zeros(self.num_envs, np.int64)
+        for block in self._blocks:
+            order = self._episode[block.rows] * block.num_groups + block.groups
+            place[block.rows] = block.starts.places(order.tolist())
+        return TensorDict(
+            {"place": torch.from_numpy(place), "episode": torch.from_numpy(self._episode.copy())}, self.batch_size
+        )
+
+    def begin_with(self, starts: TensorDictBase) -> None:
+        """Lets the next reset of all rows begin with ``starts [num_envs]``, of this env or another's
+        :meth:`draw_starts`."""
+        if starts.batch_size != self.batch_size:
+            raise ValueError(f"starts must be {list(self.batch_size)}, got {list(starts.batch_size)}")
+        self._starts = starts
+
+    @property
+    def groups_per_deal(self) -> int:
+        """Groups are dealt to the tasks in turn: one to each is a deal."""
+        return len(self.tasks)
 
     @property
     def num_envs(self) -> int:
@@ -253,15 +283,27 @@ class TabletopEnv(EnvBase):
         self._check_open()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = np.ones(self.num_envs, bool) if mask is None else mask.reshape(-1).numpy()
-        # Rows reset together stay in step, so that the rows of a group share their initial states.
-        self._episode[mask] = self._episode[mask].max(initial=-1) + 1 if mask.all() else self._episode[mask] + 1
+        starts, self._starts = self._starts, None
+        if set_state:
+            self._episode[mask] = self._episode[mask].max(initial=-1) + 1 if mask.all() else self._episode[mask] + 1
+        elif mask.all():
+            starts = self.draw_starts() if starts is None else starts
+            self._episode[:] = starts["episode"].numpy()
+        else:
+            self._episode[mask] += 1
+            starts = None
         self._steps[mask], self._terminated[mask], self._truncated[mask] = 0, False, False
         for block in self._blocks:
             local = np.flatnonzero(mask[block.rows])
             if not len(local):
                 continue
             rows = block.rows[local]
-            numbers, states = self._given(tensordict, block, rows) if set_state else self._drawn(block, local)
+            if set_state:
+                numbers, states = self._given(tensordict, block, rows)
+            elif starts is not None:
+                numbers, states = block.starts.at(starts["place"][torch.from_numpy(rows)].tolist())
+            else:
+                numbers, states = self._drawn(block, local)
             block.scene.reset(local, states)
             self._context[rows, 0] = numbers
         self._read(mask)
@@ -269,7 +311,7 @@ class TabletopEnv(EnvBase):
         return self._observe()
 
     def _drawn(self, block: _Block, local: np.ndarray) -> tuple[list[int], np.ndarray]:
-        """The next initial states of a task's rows."""
+        """The next initial states of some of a task's rows."""
         order = self._episode[block.rows[local]] * block.num_groups + block.groups[local]
         return block.starts.draw_together(order.tolist())
 

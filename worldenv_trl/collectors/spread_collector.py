@@ -1,0 +1,144 @@
+"""Waves of groups, shared out among workers."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import cloudpickle
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType
+
+from worldenv_trl.collectors.group_collector import GroupCollector, joined
+from worldenv_trl.collectors.shares import Share, Work, collect_share, shares_of, weights_of
+from worldenv_trl.collectors.workers import Stored, Workers
+from worldenv_trl.splitmix import splitmix64
+
+__all__ = ["SpreadCollector"]
+
+
+class SpreadCollector(GroupCollector):
+    """A :class:`GroupCollector` whose waves are collected by workers, some whole groups each.
+
+    ``env`` is never stepped: it draws where rollouts begin, and is what the policy is checked against. Every wave is
+    cut into ``shares`` of whole groups, and each goes to the next free worker with its starts, the policy's weights and
+    a seed of its own. So a wave is a function of the env's order, the weights, torch's random state and ``shares``,
+    never of how many workers there are, where they run, or which of them died and was replaced: bit for bit on equal
+    processors. Initial states and the world model's noise are those of a :class:`GroupCollector`; the policy's noise is
+    drawn share by share, so other ``shares`` give other samples of it, and greedy rollouts that differ by rounding.
+
+    Weights travel with the work rather than through a ``torchrl.weight_update`` scheme: its process group has no place
+    for a worker that comes back.
+
+    Args:
+        env: as of :class:`GroupCollector`, with the whole wave's batch size; it has ``draw_starts`` and ``begin_with``,
+            as :class:`~worldenv_trl.envs.TabletopEnv` and :class:`~worldenv_trl.envs.ImaginedEnv` do.
+        policy: as there; it and ``create_env_fn`` are pickled.
+        workers: who collects; they stay when the collector is shut down.
+
+    Keyword Args:
+        create_env_fn: ``create_env_fn(groups)`` makes the same env for so many groups, with the same settings (seed,
+            tasks, initial states or contexts) and on a device that the workers have.
+        shares: parts of a wave, as many as the workers at least; 8 by default, or as many as there are workers.
+        others: of :class:`GroupCollector`.
+
+    Raises:
+        ValueError: if there are more workers than shares, or shares than groups (than deals of them to the tasks), or
+            the env cannot say where its rollouts begin.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        policy: TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase] | None = None,
+        *,
+        create_env_fn: Callable[[int], EnvBase],
+        workers: Workers,
+        shares: int | None = None,
+        groups_per_batch: int,
+        total_groups: int = -1,
+        group_size: int | None = None,
+        max_decisions: int | None = None,
+        exploration_type: ExplorationType = ExplorationType.RANDOM,
+        exclude: Sequence[NestedKey] = (),
+    ) -> None:
+        super().__init__(
+            env,
+            policy,
+            groups_per_batch=groups_per_batch,
+            total_groups=total_groups,
+            group_size=group_size,
+            max_decisions=max_decisions,
+            exploration_type=exploration_type,
+            exclude=exclude,
+        )
+        deal = _entry(env, "groups_per_deal") or 1
+        if _entry(env, "draw_starts") is None:
+            raise ValueError(
+                f"{type(env).__name__} cannot say where its rollouts begin (draw_starts): collect them here"
+            )
+        check_shares(self.group_shape[0], workers.count, shares, deal)
+        self.workers = workers
+        self._bounds = shares_of(self.group_shape[0], default_shares(workers.count) if shares is None else shares, deal)
+        work = Work(create_env_fn, policy, self.group_shape[1], self.max_decisions, exploration_type)
+        self._work: Stored | None = workers.put(work)
+        self._weights: tuple[bytes, Stored] | None = None
+
+    def _wave(self) -> TensorDictBase:
+        starts = self.env.draw_starts().reshape(self.group_shape)
+        weights = self._stored_weights()
+        seeds = torch.arange(len(self._bounds)) ^ torch.randint(2**62, ())
+        shares = [
+            Share(starts[first : first + count].clone(), seed & (2**62 - 1), self.exclude)
+            for (first, count), seed in zip(self._bounds, splitmix64(seeds).tolist(), strict=True)
+        ]
+        parts = self.workers.map(collect_share, [(self._work, weights, share) for share in shares])
+        wave = joined(parts, max(part.shape[-1] for part in parts))
+        return wave if self.env.device is None else wave.to(self.env.device)
+
+    def _stored_weights(self) -> Stored | None:
+        """The policy's weights as they are now; stored again only where they have changed."""
+        weights = weights_of(self.policy)
+        if weights is None:
+            return None
+        digest = hashlib.sha256(cloudpickle.dumps(weights)).digest()
+        if self._weights is None or self._weights[0] != digest:
+            self._weights = digest, self.workers.put(weights)
+        return self._weights[1]
+
+    def shutdown(self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True) -> None:
+        super().shutdown(timeout, close_env, raise_on_error)
+        self._work = self._weights = None
+
+
+def default_shares(workers: int) -> int:
+    """Of a wave: 8, so that any number of workers up to 8 gives the same, or one for each worker."""
+    return max(8, workers)
+
+
+def check_shares(groups: int, workers: int, shares: int | None = None, deal: int = 1, name: str = "the wave") -> None:
+    """Whether a wave can be shared out.
+
+    Raises:
+        ValueError: if a worker would have nothing to do, or a share would hold no whole group.
+    """
+    deals = -(-groups // deal)
+    each = "groups" if deal == 1 else f"times {deal} groups (one for each task)"
+    if workers > deals:
+        raise ValueError(f"{workers} workers are more than {name} has {each}, {deals}: use at most {deals}")
+    if shares is not None and not workers <= shares <= deals:
+        raise ValueError(
+            f"shares must be from {workers}, the workers, to {deals}, what {name} has of {each}, got {shares}"
+        )
+
+
+def _entry(env: EnvBase, name: str) -> Any:
+    try:
+        return getattr(env, name)
+    except AttributeError:
+        return None
