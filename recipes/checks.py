@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collecting import check_collectors
 from config import WorldEnvConfig
 from loggers import check_loggers
 from parts import COMPACT, Parts
@@ -105,6 +106,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     if config.max_steps < 1 or config.max_steps % config.chunk_length:
         raise ValueError(f"max_steps must be a multiple of chunk_length={config.chunk_length}, got {config.max_steps}")
     check_loggers(config.logger)
+    check_collectors(config)
     digests: dict[str, str] = {}
     for name in config.tasks:
         digest = load_task(name).digest

@@ -157,6 +157,10 @@ class WorldEnvConfig:
     device: str = "auto"
     """Of the models, imagination and every update: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one.
     The physics and the recordings stay on the CPU."""
+    collectors: str = "local"
+    """Who explores, imagines and evaluates: ``local``, this process; ``process:2``, two others of one thread each;
+    ``ray:4``, four of a Ray cluster (``RAY_ADDRESS``, or one of this machine): pip install worldenv_trl[ray].
+    ``ray:4/12`` cuts every wave into 12 shares instead of 8: equal shares give equal rollouts, whoever collects."""
     checkpoint_minutes: float = 2.0
     """Between two checkpoints of the running stage: at most so much is lost when it is killed."""
     logger: tuple[str, ...] = ()

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from collecting import of_worker
 from imagination import Imagination, frames_aside
 from physics import exploring_actor, physics_waves_env, recording
 from probes import probe, probed_iterations, warning
@@ -61,14 +63,19 @@ def post_train(
     shape = [settings.groups, settings.group_size]
     if settings.env == "imagined":
         imagination = Imagination.load(run, models)
-        env = imagination.env(run, shape, seed=run.seed(target, "env"), sampler=sampler)
+        seed = run.seed(target, "env")
+        env = imagination.env(run, shape, seed=seed, sampler=sampler)
+        make = imagination.makes(run, settings.group_size, seed=seed)
         judges = {"world_model": imagination.world_model, "reflector": imagination.reflector}
     else:
         imagination, judges = None, {}
-        env = physics_waves_env(config, *shape, seed=run.seed(target, "env"), sampler=sampler)
-    collector = GroupCollector(
+        seeded: dict[str, Any] = {"group_size": settings.group_size, "seed": run.seed(target, "env")}
+        env = physics_waves_env(config, settings.groups, sampler=sampler, **seeded)
+        make = partial(physics_waves_env, of_worker(config), **seeded)
+    collector = run.group_collector(
         env,
         DeviceBridge(actor),
+        make,
         groups_per_batch=settings.groups,
         total_groups=settings.iterations * settings.groups,
         group_size=settings.group_size,
@@ -89,7 +96,8 @@ def post_train(
 
     probed, recorded = probed_iterations(settings), {0, settings.iterations - 1}
     alarm = HonestyAlarm(len(probed), false_alarm_rate=settings.false_alarm_rate) if probed and imagination else None
-    aside, counts = frames_aside(env), {"stuck": 0}
+    aside = frames_aside(env) if run.workers is None else None  # frames of workers come with their waves
+    counts = {"stuck": 0}
     learning: dict[str, Any] = {"collector": collector, "optimizer": optimizer, "mean": mean, "alarm": alarm}
     left = Resumable(run, "iterations", settings.iterations, counts=counts, **learning)
     _record_next(left.step in recorded, collector, aside)
@@ -142,8 +150,8 @@ def post_train(
 
 
 def _record_next(yes: bool, collector: GroupCollector, aside: FramesAside | None) -> None:
-    """Waves carry what is learned from; those that are recorded carry all, and their frames go to disk."""
-    collector.exclude = () if yes else [("next", "observation")]
+    """Waves carry what is learned from; those that are recorded carry all, and frames made here go to disk."""
+    collector.exclude = ["frames"] if yes else ["frames", ("next", "frames"), ("next", "observation")]
     if aside is not None:
         aside.keep = yes
 

@@ -86,7 +86,7 @@ def run_alone(kind: str, work: Work, arguments: Sequence[str] | None = None, par
     """
     config = parse(sys.argv[1:] if arguments is None else arguments, work.__module__)
     run = open_run(config, parts)
-    with closing(run.folder.loggers):
+    with closing(run.folder.loggers), closing(run):
         rerun(kind, work, run)
 
 
@@ -117,8 +117,10 @@ def open_run(config: WorldEnvConfig, parts: Parts = COMPACT) -> Run:
         folder = RunFolder(config.run_dir)
         folder.open(config, {task: load_task(task).digest for task in config.tasks})
         folder.start_logging(config)
-    use_threads(config.num_threads)
-    return Run(config, folder, parts)
+        run = Run(config, folder, parts)
+        use_threads(config.num_threads)
+        run.workers  # noqa: B018 - a cluster without room says so now
+    return run
 
 
 def _finished(stage: Stage, folder: RunFolder) -> bool:

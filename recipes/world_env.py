@@ -43,7 +43,7 @@ WORKS: dict[str, Work] = {
 def run_all(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     """Runs what is not finished yet, then prints the table and writes the plots and the report."""
     run = open_run(config, parts)
-    with closing(run.folder.loggers) as loggers:
+    with closing(run.folder.loggers) as loggers, closing(run):
         run_stages(run, WORKS)
         loggers.images(plot_run(run.folder.path))
         summarize(run)

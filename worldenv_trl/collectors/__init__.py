@@ -10,7 +10,8 @@ with warnings.catch_warnings():
     from worldenv_trl.collectors.group_collector import GroupCollector
 
 from worldenv_trl.collectors.ray_workers import RayWorkers, check_ray
-from worldenv_trl.collectors.spread_collector import SpreadCollector, check_shares
+from worldenv_trl.collectors.shares import check_shares
+from worldenv_trl.collectors.spread_collector import SpreadCollector
 from worldenv_trl.collectors.workers import ProcessWorkers, Workers
 
 __all__ = ["GroupCollector", "ProcessWorkers", "RayWorkers", "SpreadCollector", "Workers", "check_ray", "check_shares"]

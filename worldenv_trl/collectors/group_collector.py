@@ -118,14 +118,18 @@ class GroupCollector(BaseCollector):
         **engine: Any,
     ) -> None:
         super().__init__()
-        refused = [name for name in _REFUSED if engine.get(name) not in (None, False, 0)]
+        refused = [name for name in _REFUSED if engine.get(name) not in (None, False, 0, -1)]
         if refused:
             raise ValueError(f"groups are collected whole: {refused[0]}={engine[refused[0]]!r} would cut or mix them")
         if policy is not None and policy_factory is not None:
             raise ValueError("give policy or policy_factory, not both")
         env: Any = create_env_fn
+        if isinstance(env, list | tuple):  # TorchRL's Ray engine gives every collector a list
+            if len(env) != 1:
+                raise ValueError(f"a GroupCollector steps one env, got {len(env)}: give it more groups instead")
+            env = env[0]
         if not isinstance(env, EnvBase):
-            env = create_env_fn(**dict(create_env_kwargs or {}))
+            env = env(**dict(create_env_kwargs or {}))
         if env_device is not None and env.device != torch.device(env_device):
             env = env.to(env_device)
         policy = policy if policy_factory is None else policy_factory()
@@ -197,6 +201,9 @@ class GroupCollector(BaseCollector):
         if self.total_groups == -1:
             raise RuntimeError("this collector is endless (total_groups=-1): it has no length")
         return self.total_groups // self.groups_per_batch
+
+    def __bool__(self) -> bool:
+        return True  # whoever asks whether there is a collector shall not get its length
 
     def _batch(self) -> TensorDictBase:
         if self.closed:

@@ -65,14 +65,14 @@ class RayWorkers:
             started, which ends with the program.
 
     Keyword Args:
-        num_gpus: of each actor, may be a fraction.
+        gpu: whether each actor has its share of the cluster's GPUs, one at most.
 
     Raises:
         ValueError: if ``count`` is below 1, Ray is not installed, or the address is none.
         RuntimeError: if no cluster answers, or it has no room for so many.
     """
 
-    def __init__(self, count: int, address: str | None = None, *, num_gpus: float = 0.0) -> None:
+    def __init__(self, count: int, address: str | None = None, *, gpu: bool = False) -> None:
         if count < 1:
             raise ValueError(f"workers must be at least 1, got {count}")
         check_ray(address)
@@ -86,6 +86,7 @@ class RayWorkers:
         if room < count:
             self.shutdown()
             raise RuntimeError(f"{count} Ray workers need as many CPUs, the cluster has {room}: use at most {room}")
+        num_gpus = min(1.0, ray.cluster_resources().get("GPU", 0.0) / count) if gpu else 0.0
         actor = ray.remote(num_cpus=1, num_gpus=num_gpus, max_restarts=-1, max_task_retries=ATTEMPTS - 1)(_Actor)
         self._actors = [actor.remote() for _ in range(count)]
         ready, missing = ray.wait(

@@ -19,7 +19,7 @@ from torchrl.envs.utils import ExplorationType
 from worldenv_trl.collectors.group_collector import GroupCollector
 from worldenv_trl.collectors.workers import Stored
 
-__all__ = ["Share", "Work", "collect_share", "shares_of"]
+__all__ = ["Share", "Work", "check_shares", "collect_share", "shares_of"]
 
 _HELD = 6  # envs of a worker: those of a stage, and of its probes
 
@@ -78,6 +78,20 @@ def shares_of(groups: int, count: int, deal: int = 1) -> list[tuple[int, int]]:
     count = min(count, deals)
     bounds = [min(groups, deal * (index * (deals // count) + min(index, deals % count))) for index in range(count + 1)]
     return [(first, last - first) for first, last in itertools.pairwise(bounds)]
+
+
+def check_shares(groups: int, workers: int, deal: int = 1, name: str = "the wave") -> None:
+    """Whether every worker would have something to do with a wave.
+
+    Raises:
+        ValueError: if there are more of them than groups (deals of one for each task), naming both.
+    """
+    deals = -(-groups // deal)
+    if workers > deals:
+        dealt = "" if deal == 1 else f", {deals} with one for each of {deal} tasks"
+        raise ValueError(
+            f"{workers} workers are more than the groups of {name}={groups}{dealt}: use at most {deals}, or more groups"
+        )
 
 
 def collect_share(work: Stored, weights: Stored | None, share: Share) -> TensorDictBase:

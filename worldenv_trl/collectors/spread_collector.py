@@ -22,6 +22,9 @@ from worldenv_trl.splitmix import splitmix64
 __all__ = ["SpreadCollector"]
 
 
+_SHARES = 8  # the same for any number of workers up to so many
+
+
 class SpreadCollector(GroupCollector):
     """A :class:`GroupCollector` whose waves are collected by workers, some whole groups each.
 
@@ -44,12 +47,12 @@ class SpreadCollector(GroupCollector):
     Keyword Args:
         create_env_fn: ``create_env_fn(groups)`` makes the same env for so many groups, with the same settings (seed,
             tasks, initial states or contexts) and on a device that the workers have.
-        shares: parts of a wave, as many as the workers at least; 8 by default, or as many as there are workers.
+        shares: parts of a wave, 8 by default, or as many as there are workers; of a smaller wave, as many as it has
+            groups (deals of them to the tasks).
         others: of :class:`GroupCollector`.
 
     Raises:
-        ValueError: if there are more workers than shares, or shares than groups (than deals of them to the tasks), or
-            the env cannot say where its rollouts begin.
+        ValueError: if ``shares`` is below 1, or the env cannot say where its rollouts begin.
     """
 
     def __init__(
@@ -82,9 +85,11 @@ class SpreadCollector(GroupCollector):
             raise ValueError(
                 f"{type(env).__name__} cannot say where its rollouts begin (draw_starts): collect them here"
             )
-        check_shares(self.group_shape[0], workers.count, shares, deal)
+        shares = max(_SHARES, workers.count) if shares is None else shares
+        if shares < 1:
+            raise ValueError(f"shares must be at least 1, got {shares}")
         self.workers = workers
-        self._bounds = shares_of(self.group_shape[0], default_shares(workers.count) if shares is None else shares, deal)
+        self._bounds = shares_of(self.group_shape[0], shares, deal)
         work = Work(create_env_fn, policy, self.group_shape[1], self.max_decisions, exploration_type)
         self._work: Stored | None = workers.put(work)
         self._weights: tuple[bytes, Stored] | None = None
@@ -114,27 +119,6 @@ class SpreadCollector(GroupCollector):
     def shutdown(self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True) -> None:
         super().shutdown(timeout, close_env, raise_on_error)
         self._work = self._weights = None
-
-
-def default_shares(workers: int) -> int:
-    """Of a wave: 8, so that any number of workers up to 8 gives the same, or one for each worker."""
-    return max(8, workers)
-
-
-def check_shares(groups: int, workers: int, shares: int | None = None, deal: int = 1, name: str = "the wave") -> None:
-    """Whether a wave can be shared out.
-
-    Raises:
-        ValueError: if a worker would have nothing to do, or a share would hold no whole group.
-    """
-    deals = -(-groups // deal)
-    each = "groups" if deal == 1 else f"times {deal} groups (one for each task)"
-    if workers > deals:
-        raise ValueError(f"{workers} workers are more than {name} has {each}, {deals}: use at most {deals}")
-    if shares is not None and not workers <= shares <= deals:
-        raise ValueError(
-            f"shares must be from {workers}, the workers, to {deals}, what {name} has of {each}, got {shares}"
-        )
 
 
 def _entry(env: EnvBase, name: str) -> Any:
