@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import cloudpickle
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -92,7 +90,7 @@ class SpreadCollector(GroupCollector):
         self._bounds = shares_of(self.group_shape[0], shares, deal)
         work = Work(create_env_fn, policy, self.group_shape[1], self.max_decisions, exploration_type)
         self._work: Stored | None = workers.put(work)
-        self._weights: tuple[bytes, Stored] | None = None
+        self._weights: tuple[TensorDictBase, Stored] | None = None
 
     def _wave(self) -> TensorDictBase:
         starts = self.env.draw_starts().reshape(self.group_shape)
@@ -111,9 +109,8 @@ class SpreadCollector(GroupCollector):
         weights = weights_of(self.policy)
         if weights is None:
             return None
-        digest = hashlib.sha256(cloudpickle.dumps(weights)).digest()
-        if self._weights is None or self._weights[0] != digest:
-            self._weights = digest, self.workers.put(weights)
+        if self._weights is None or not bool((self._weights[0] == weights).all()):
+            self._weights = weights, self.workers.put(weights)
         return self._weights[1]
 
     def shutdown(self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True) -> None:

@@ -1,0 +1,140 @@
+"""How a wave is cut, and where its rollouts begin, here or elsewhere."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from shared_waves import (
+    DECISIONS,
+    GROUPS,
+    ROLLOUTS,
+    Here,
+    assert_equal,
+    contexts,
+    make_env,
+    make_policy,
+    spread,
+    waves_of,
+)
+from torchrl.envs.utils import ExplorationType
+
+from worldenv_trl.collectors import check_shares
+from worldenv_trl.collectors.shares import shares_of
+from worldenv_trl.envs import ContextSampler
+from worldenv_trl.keys import CHUNK, CONTEXT_ID
+
+
+@pytest.mark.parametrize("deal", [1, 2, 3])
+@pytest.mark.parametrize("groups", [1, 2, 7, 24, 32])
+@pytest.mark.parametrize("count", [1, 2, 5, 8, 40])
+def test_shares_hold_every_group_once_and_begin_with_a_deal(groups, count, deal):
+    shares = shares_of(groups, count, deal)
+    assert [group for first, size in shares for group in range(first, first + size)] == list(range(groups))
+    assert all(first % deal == 0 and size for first, size in shares)
+    assert len(shares) == min(count, -(-groups // deal))
+    assert max(size for _, size in shares) - min(size for _, size in shares[:-1] or shares) <= deal
+
+
+def test_groups_are_whole_and_from_the_contexts_that_one_process_draws():
+    alone, shared = waves_of(spread(None)), waves_of(spread(Here()))
+    assert contexts(shared) == contexts(alone)
+    assert all(len(set(group)) == 1 for wave in shared for group in wave[CONTEXT_ID][:, :, 0, 0].tolist())
+    assert shared[0].shape == (GROUPS, ROLLOUTS, DECISIONS)
+
+
+def test_noise_differs_between_shares_waves_and_rollouts():
+    noise = torch.stack([wave[CHUNK] for wave in waves_of(spread(Here()))])  # [waves, G, N, T, C, 7]
+    assert noise.flatten().unique().numel() > 0.99 * noise.numel()
+
+
+def test_how_many_workers_there_are_changes_nothing():
+    one, three = Here(1), Here(3)
+    assert_equal(waves_of(spread(one)), waves_of(spread(three)))
+    assert one.given == three.given == 2 * 3  # three deals to two tasks, each a share
+
+
+def test_other_shares_begin_alike_and_draw_other_noise():
+    three, two = waves_of(spread(Here(), shares=3)), waves_of(spread(Here(), shares=2))
+    assert contexts(three) == contexts(two)
+    assert not torch.equal(three[0][CHUNK], two[0][CHUNK])
+
+
+def test_without_noise_any_shares_give_what_one_process_gives():
+    def quiet():
+        policy = make_policy()
+        policy.module.forward = lambda state: 0.1 * state.mean(-1)[:, None, None].expand(-1, 8, 7)
+        return policy
+
+    greedy = {"exploration_type": ExplorationType.DETERMINISTIC}
+    alone = waves_of(spread(None, quiet(), **greedy))
+    for shares in (1, 2, 3):
+        assert_equal(alone, waves_of(spread(Here(), quiet(), shares=shares, **greedy)))
+
+
+def test_new_weights_reach_the_next_wave():
+    policy = make_policy()
+    collector = spread(Here(), policy, waves=2)
+    before = collector.next()
+    with torch.no_grad():
+        policy.module.weight.zero_()
+    assert before[CHUNK].abs().min() > 0 and collector.next()[CHUNK].abs().max() == 0
+
+
+def test_weights_that_stay_are_stored_once():
+    stored, workers = [], Here()
+    keep, workers.put = workers.put, lambda value: stored.append(value) or keep(value)
+    waves_of(spread(workers, waves=3))
+    assert len(stored) == 2  # the work and the weights
+
+
+def test_a_collector_continues_from_its_state_and_torchs():
+    collector = spread(Here(), waves=3)
+    collector.next()
+    state, random = collector.state_dict(), torch.get_rng_state()
+    rest = waves_of(collector)
+    again = spread(Here(), waves=3)
+    again.load_state_dict(state)
+    torch.set_rng_state(random)
+    assert_equal(waves_of(again), rest)
+
+
+def test_a_context_sampler_draws_here_and_learns_from_what_comes_back():
+    drawn = []
+    for workers in (None, Here()):
+        sampler = ContextSampler(seed=1)
+        collector = spread(workers, waves=3)
+        collector.env.close()
+        collector.env = make_env(GROUPS, context_sampler=sampler)
+        drawn.append([])
+        for wave in collector:
+            numbers = wave[CONTEXT_ID][:, 0, 0, 0]
+            drawn[-1].append(numbers.tolist())
+            sampler.update(numbers, torch.stack([numbers % 2, torch.ones_like(numbers)], -1).float())
+        collector.shutdown()
+    assert drawn[0] == drawn[1]
+
+
+def test_excluded_entries_stay_where_they_are_made():
+    wave = waves_of(spread(Here(), waves=1, exclude=["observation", ("next", "observation")]))[0]
+    assert "observation" not in wave.keys() and "observation" not in wave["next"].keys()  # noqa: SIM118 - no dict
+
+
+@pytest.mark.parametrize(
+    ("groups", "workers", "deal", "most"), [(3, 4, 1, "at most 3"), (6, 3, 3, "2 with one for each of 3 tasks")]
+)
+def test_more_workers_than_groups_are_refused_in_one_line(groups, workers, deal, most):
+    check_shares(groups, -(-groups // deal), deal)
+    with pytest.raises(ValueError, match=f"^{workers} workers .* explore.num_envs={groups}.*{most}") as error:
+        check_shares(groups, workers, deal, "explore.num_envs")
+    assert "\n" not in str(error.value)
+
+
+def test_what_cannot_be_shared_out_is_refused():
+    with pytest.raises(ValueError, match="shares must be at least 1, got 0"):
+        spread(Here(), shares=0)
+    from test_group_collector import WAVES, CountdownEnv
+
+    from worldenv_trl.collectors import SpreadCollector
+
+    with pytest.raises(ValueError, match="CountdownEnv cannot say where its rollouts begin"):
+        SpreadCollector(CountdownEnv(WAVES, [2, 3]), None, create_env_fn=make_env, workers=Here(), groups_per_batch=2)
