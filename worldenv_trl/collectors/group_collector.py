@@ -221,11 +221,11 @@ class GroupCollector(BaseCollector):
                 *batch.shape[:2], 1
             )
             batch[_TRAJ_IDS] = numbers.expand(batch.shape).contiguous()
-        if self.storing_device is not None:
-            batch = batch.to(self.storing_device)
         self._groups += self.groups_per_batch
         self._frames += int(batch[keys.MASK].sum())
         self._iter += 1
+        if self.storing_device is not None:
+            batch = batch.to(self.storing_device)
         if self.post_collect_hook is not None:
             self.post_collect_hook(batch)
         return batch
