@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from config import WorldEnvConfig
+from threads import OF_A_WORKER
 from worldenv_trl.collectors import ProcessWorkers, RayWorkers, Workers, check_ray, check_shares
 
 
@@ -79,5 +80,5 @@ def start_workers(spread: Spread, device: torch.device) -> Workers:
 
 
 def of_worker(config: WorldEnvConfig) -> WorldEnvConfig:
-    """Settings of an env of a worker, which has one thread."""
-    return dataclasses.replace(config, num_threads=1)
+    """Settings of an env of a worker."""
+    return dataclasses.replace(config, num_threads=OF_A_WORKER)

@@ -160,7 +160,7 @@ class WorldEnvConfig:
     collectors: str = "local"
     """Who explores, imagines and evaluates: ``local``, this process; ``process:2``, two others of one thread each;
     ``ray:4``, four of a Ray cluster (``RAY_ADDRESS``, or one of this machine): pip install worldenv_trl[ray].
-    ``ray:4/12`` cuts every wave into 12 shares instead of 8: equal shares give equal rollouts, whoever collects."""
+    ``ray:4/12`` cuts every wave into 12 shares: equal shares give equal rollouts, whoever collects them."""
     checkpoint_minutes: float = 2.0
     """Between two checkpoints of the running stage: at most so much is lost when it is killed."""
     logger: tuple[str, ...] = ()

@@ -40,6 +40,7 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
                 env,
                 player,
                 partial(step_env, of_worker(config), "train", **options),
+                steady=True,
                 groups_per_batch=settings.num_envs,
                 group_size=1,
                 total_groups=waves * settings.num_envs,

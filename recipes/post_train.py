@@ -76,6 +76,7 @@ def post_train(
         env,
         DeviceBridge(actor),
         make,
+        steady=False,
         groups_per_batch=settings.groups,
         total_groups=settings.iterations * settings.groups,
         group_size=settings.group_size,

@@ -61,17 +61,20 @@ class Run:
             workers.shutdown()
 
     def group_collector(
-        self, env: EnvBase, policy: Any, create_env_fn: Callable[[int], EnvBase], **options: Any
+        self, env: EnvBase, policy: Any, create_env_fn: Callable[[int], EnvBase], *, steady: bool, **options: Any
     ) -> GroupCollector:
         """Collects waves of ``env``: here or, with the envs that ``create_env_fn(groups)`` makes, by the workers.
 
         Keyword Args:
+            steady: whether the policy stays from wave to wave, so that workers may collect several at once.
             options: of :class:`~worldenv_trl.collectors.GroupCollector`.
         """
         spread = spread_of(self.config.collectors)
         if spread is None or self.workers is None:
             return GroupCollector(env, policy, **options)
         spreads = options | {"workers": self.workers, "shares": spread.shares}
+        if steady:
+            spreads["waves_at_once"] = self.workers.count
         return SpreadCollector(env, policy, create_env_fn=create_env_fn, **spreads)
 
     @cached_property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -20,7 +21,7 @@ from worldenv_trl.splitmix import splitmix64
 __all__ = ["SpreadCollector"]
 
 
-_SHARES = 8  # the same for any number of workers up to so many
+_SHARES, _ROWS = 8, 16  # parts of a wave by default: so many at most, with so many rollouts at least
 
 
 class SpreadCollector(GroupCollector):
@@ -29,7 +30,7 @@ class SpreadCollector(GroupCollector):
     ``env`` is never stepped: it draws where rollouts begin, and is what the policy is checked against. Every wave is
     cut into ``shares`` of whole groups, and each goes to the next free worker with its starts, the policy's weights and
     a seed of its own. So a wave is a function of the env's order, the weights, torch's random state and ``shares``,
-    never of how many workers there are, where they run, or which of them died and was replaced: bit for bit on equal
+    never of how many workers collect them, where they run, or which of them died and was replaced: bit for bit on equal
     processors. Initial states and the world model's noise are those of a :class:`GroupCollector`; the policy's noise is
     drawn share by share, so other ``shares`` give other samples of it, and greedy rollouts that differ by rounding.
 
@@ -45,12 +46,14 @@ class SpreadCollector(GroupCollector):
     Keyword Args:
         create_env_fn: ``create_env_fn(groups)`` makes the same env for so many groups, with the same settings (seed,
             tasks, initial states or contexts) and on a device that the workers have.
-        shares: parts of a wave, 8 by default, or as many as there are workers; of a smaller wave, as many as it has
-            groups (deals of them to the tasks).
+        shares: parts of a wave; by default one for every 16 rollouts, 8 at most, but enough for all workers. Never
+            more than it has groups (deals of them to the tasks).
+        waves_at_once: collected together, and yielded one after the other. The policy and :attr:`exclude` must not
+            change between them, nor is the state between them one to continue from.
         others: of :class:`GroupCollector`.
 
     Raises:
-        ValueError: if ``shares`` is below 1, or the env cannot say where its rollouts begin.
+        ValueError: if ``shares`` or ``waves_at_once`` is below 1, or the env cannot say where its rollouts begin.
     """
 
     def __init__(
@@ -61,6 +64,7 @@ class SpreadCollector(GroupCollector):
         create_env_fn: Callable[[int], EnvBase],
         workers: Workers,
         shares: int | None = None,
+        waves_at_once: int = 1,
         groups_per_batch: int,
         total_groups: int = -1,
         group_size: int | None = None,
@@ -83,26 +87,54 @@ class SpreadCollector(GroupCollector):
             raise ValueError(
                 f"{type(env).__name__} cannot say where its rollouts begin (draw_starts): collect them here"
             )
-        shares = max(_SHARES, workers.count) if shares is None else shares
-        if shares < 1:
-            raise ValueError(f"shares must be at least 1, got {shares}")
-        self.workers = workers
+        groups, rollouts = self.group_shape
+        if shares is None:
+            enough = -(-workers.count // waves_at_once) if waves_at_once > 0 else 1
+            shares = max(1, min(_SHARES, groups * rollouts // _ROWS), enough)
+        for name, count in (("shares", shares), ("waves_at_once", waves_at_once)):
+            if count < 1:
+                raise ValueError(f"{name} must be at least 1, got {count}")
+        self.workers, self.waves_at_once = workers, waves_at_once
         self._bounds = shares_of(self.group_shape[0], shares, deal)
         work = Work(create_env_fn, policy, self.group_shape[1], self.max_decisions, exploration_type)
         self._work: Stored | None = workers.put(work)
         self._weights: tuple[TensorDictBase, Stored] | None = None
+        self._ready: deque[TensorDictBase] = deque()
+        self._begun = 0  # waves, those that are ready included
 
     def _wave(self) -> TensorDictBase:
-        starts = self.env.draw_starts().reshape(self.group_shape)
+        if not self._ready:
+            count = self.waves_at_once
+            if self.total_groups != -1:
+                count = min(count, self.total_groups // self.group_shape[0] - self._begun)
+            self._ready.extend(self._waves(count))
+            self._begun += count
+        return self._ready.popleft()
+
+    def _waves(self, count: int) -> list[TensorDictBase]:
         weights = self._stored_weights()
-        seeds = torch.arange(len(self._bounds)) ^ torch.randint(2**62, ())
-        shares = [
-            Share(starts[first : first + count].clone(), seed & (2**62 - 1), self.exclude)
-            for (first, count), seed in zip(self._bounds, splitmix64(seeds).tolist(), strict=True)
-        ]
+        shares = [share for _ in range(count) for share in self._shares()]
         parts = self.workers.map(collect_share, [(self._work, weights, share) for share in shares])
-        wave = joined(parts, max(part.shape[-1] for part in parts))
-        return wave if self.env.device is None else wave.to(self.env.device)
+        waves = []
+        for number in range(count):
+            own = parts[number * len(self._bounds) : (number + 1) * len(self._bounds)]
+            wave = joined(own, max(part.shape[-1] for part in own))
+            waves.append(wave if self.env.device is None else wave.to(self.env.device))
+        return waves
+
+    def _shares(self) -> list[Share]:
+        """Of the next wave."""
+        starts = self.env.draw_starts().reshape(self.group_shape)
+        seeds = splitmix64(torch.arange(len(self._bounds)) ^ torch.randint(2**62, ())) & (2**62 - 1)
+        return [
+            Share(starts[first : first + count].clone(), seed, self.exclude)
+            for (first, count), seed in zip(self._bounds, seeds.tolist(), strict=True)
+        ]
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        self._ready.clear()
+        self._begun = self._groups // self.group_shape[0]
 
     def _stored_weights(self) -> Stored | None:
         """The policy's weights as they are now; stored again only where they have changed."""
