@@ -16,9 +16,10 @@ from shared_waves import (
     spread,
     waves_of,
 )
+from test_group_collector import WAVES, CountdownEnv
 from torchrl.envs.utils import ExplorationType
 
-from worldenv_trl.collectors import check_shares
+from worldenv_trl.collectors import SpreadCollector, check_shares
 from worldenv_trl.collectors.shares import shares_of
 from worldenv_trl.envs import ContextSampler
 from worldenv_trl.keys import CHUNK, CONTEXT_ID
@@ -49,8 +50,38 @@ def test_noise_differs_between_shares_waves_and_rollouts():
 
 def test_how_many_workers_there_are_changes_nothing():
     one, three = Here(1), Here(3)
-    assert_equal(waves_of(spread(one)), waves_of(spread(three)))
-    assert one.given == three.given == 2 * 3  # three deals to two tasks, each a share
+    assert_equal(waves_of(spread(one, shares=3)), waves_of(spread(three, shares=3)))
+    assert one.given == three.given == 2 * 3
+
+
+@pytest.mark.parametrize(
+    ("workers", "rollouts", "shares"), [(1, 12, 1), (1, 60, 3), (3, 60, 3), (5, 60, 5), (9, 300, 9)]
+)
+def test_a_wave_has_a_share_for_every_16_rollouts_and_enough_for_all_workers(workers, rollouts, shares):
+    collector = SpreadCollector(
+        make_env(rollouts // 2),
+        make_policy(),
+        create_env_fn=make_env,
+        workers=Here(workers),
+        groups_per_batch=rollouts // 2,
+        group_size=2,
+    )
+    assert len(collector._bounds) == shares
+    collector.shutdown()
+
+
+@pytest.mark.parametrize("at_once", [2, 3, 5])
+def test_waves_collected_at_once_are_those_collected_one_by_one(at_once):
+    together, alone = Here(4), Here(1)
+    waves = waves_of(spread(together, waves=3, shares=2, waves_at_once=at_once))
+    assert_equal(waves, waves_of(spread(alone, waves=3, shares=2)))
+    assert together.given == alone.given == 3 * 2  # none too many
+
+
+def test_waves_at_once_start_no_more_workers_than_they_need_shares():
+    collector = spread(Here(4), waves=4, waves_at_once=4)
+    assert len(collector._bounds) == 1  # four waves of one share
+    collector.shutdown()
 
 
 def test_other_shares_begin_alike_and_draw_other_noise():
@@ -130,11 +161,8 @@ def test_more_workers_than_groups_are_refused_in_one_line(groups, workers, deal,
 
 
 def test_what_cannot_be_shared_out_is_refused():
-    with pytest.raises(ValueError, match="shares must be at least 1, got 0"):
-        spread(Here(), shares=0)
-    from test_group_collector import WAVES, CountdownEnv
-
-    from worldenv_trl.collectors import SpreadCollector
-
+    for option in ("shares", "waves_at_once"):
+        with pytest.raises(ValueError, match=f"{option} must be at least 1, got 0"):
+            spread(Here(), **{option: 0})
     with pytest.raises(ValueError, match="CountdownEnv cannot say where its rollouts begin"):
         SpreadCollector(CountdownEnv(WAVES, [2, 3]), None, create_env_fn=make_env, workers=Here(), groups_per_batch=2)
