@@ -67,6 +67,11 @@ def test_an_engine_that_would_cut_groups_is_refused():
             GroupCollector(partial(make_env, GROUPS), make_policy(), groups_per_batch=GROUPS, group_size=2, **option)
 
 
+def test_an_option_that_nobody_knows_is_refused():
+    with pytest.raises(TypeError, match="GroupCollector has no option 'max_decision'"):
+        GroupCollector(partial(make_env, GROUPS), make_policy(), groups_per_batch=GROUPS, group_size=2, max_decision=3)
+
+
 def test_batches_longer_than_their_length_are_refused():
     sizes = SIZES | {"length": DECISIONS - 1}
     collector = GroupCollector(partial(make_env, GROUPS), make_policy(), **sizes)

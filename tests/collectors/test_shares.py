@@ -55,9 +55,9 @@ def test_how_many_workers_there_are_changes_nothing():
 
 
 @pytest.mark.parametrize(
-    ("workers", "rollouts", "shares"), [(1, 12, 1), (1, 60, 3), (3, 60, 3), (5, 60, 5), (9, 300, 9)]
+    ("workers", "rollouts", "shares"), [(1, 12, 1), (1, 60, 2), (3, 60, 3), (1, 300, 8), (9, 300, 9)]
 )
-def test_a_wave_has_a_share_for_every_16_rollouts_and_enough_for_all_workers(workers, rollouts, shares):
+def test_a_wave_has_a_share_for_every_24_rollouts_and_enough_for_all_workers(workers, rollouts, shares):
     collector = SpreadCollector(
         make_env(rollouts // 2),
         make_policy(),
@@ -79,9 +79,10 @@ def test_waves_collected_at_once_are_those_collected_one_by_one(at_once):
 
 
 def test_waves_at_once_start_no_more_workers_than_they_need_shares():
-    collector = spread(Here(4), waves=4, waves_at_once=4)
-    assert len(collector._bounds) == 1  # four waves of one share
-    collector.shutdown()
+    for waves, shares in ((4, 1), (2, 2), (1, 3)):  # of 12 rollouts in three deals
+        collector = spread(Here(4), waves=waves, waves_at_once=4)
+        assert len(collector._bounds) == shares
+        collector.shutdown()
 
 
 def test_other_shares_begin_alike_and_draw_other_noise():

@@ -25,7 +25,7 @@ __all__ = ["GroupCollector"]
 
 _READ = (("next", "reward"), ("next", "done"))  # by the collector itself
 _TRAJ_IDS = ("collector", "traj_ids")
-# What TorchRL's engines hand to every collector and what would change the rollouts; the rest of it has no meaning here.
+# What TorchRL's engines hand to every collector: what would cut or mix groups, and what has no meaning for them.
 _REFUSED = (
     "compact_obs",
     "compile_policy",
@@ -36,7 +36,23 @@ _REFUSED = (
     "postproc",
     "replay_buffer",
     "split_trajs",
+    "track_policy_version",
     "trajs_per_batch",
+)
+_IGNORED = (
+    "auto_register_policy_transforms",
+    "extend_buffer",
+    "frames_per_batch",
+    "no_cuda_sync",
+    "reset_at_each_iter",
+    "reset_when_done",
+    "return_same_td",
+    "set_truncated",
+    "total_frames",
+    "traj_pool",
+    "trajs_per_write",
+    "trust_policy",
+    "use_buffers",
 )
 
 
@@ -69,10 +85,12 @@ class GroupCollector(BaseCollector):
             copy up to date. Where the policy is when None.
         env_device: where the env is moved; where it is when None.
         storing_device: where batches are yielded; the env's when None.
+        device: of the three above that are None.
         create_env_kwargs: of ``create_env_fn``.
         length: decisions of every batch, which are padded outside the mask and numbered in ``("collector",
             "traj_ids")``: engines stack the batches of their workers. As long as the longest rollout when None.
-        engine: what TorchRL's engines pass to every collector. Options that would change the rollouts are refused.
+        worker_idx, pre_collect_hook, post_collect_hook, engine: what TorchRL's engines pass to every collector. Options
+            that would cut or mix groups are refused, those without a meaning for groups are ignored.
 
     Yields:
         TensorDict ``[groups, N, T]`` as ``env.rollout`` writes it, with ``("collector", "mask")`` bool [groups, N, T]:
@@ -82,6 +100,7 @@ class GroupCollector(BaseCollector):
     Raises:
         ValueError: if sizes do not divide or are below 1, a policy was trained for another env, ``exclude`` names
             reward or done flags, or an engine asks for what would cut groups.
+        TypeError: for an unknown option.
 
     Examples:
         >>> from worldenv_trl.envs import TabletopEnv, chunked
@@ -114,10 +133,17 @@ class GroupCollector(BaseCollector):
         env_device: torch.device | str | None = None,
         storing_device: torch.device | str | None = None,
         create_env_kwargs: Mapping[str, Any] | None = None,
+        device: torch.device | str | None = None,
         length: int | None = None,
+        worker_idx: int | None = None,
+        pre_collect_hook: Callable[[], None] | None = None,
+        post_collect_hook: Callable[[TensorDictBase], None] | None = None,
         **engine: Any,
     ) -> None:
         super().__init__()
+        unknown = sorted(engine.keys() - {*_REFUSED, *_IGNORED})
+        if unknown:
+            raise TypeError(f"GroupCollector has no option {unknown[0]!r}")
         refused = [name for name in _REFUSED if engine.get(name) not in (None, False, 0, -1)]
         if refused:
             raise ValueError(f"groups are collected whole: {refused[0]}={engine[refused[0]]!r} would cut or mix them")
@@ -130,6 +156,9 @@ class GroupCollector(BaseCollector):
             env = env[0]
         if not isinstance(env, EnvBase):
             env = env(**dict(create_env_kwargs or {}))
+        env_device = device if env_device is None else env_device
+        policy_device = device if policy_device is None else policy_device
+        storing_device = device if storing_device is None else storing_device
         if env_device is not None and env.device != torch.device(env_device):
             env = env.to(env_device)
         policy = policy if policy_factory is None else policy_factory()
@@ -162,8 +191,8 @@ class GroupCollector(BaseCollector):
                 self.policy = copy.deepcopy(policy).to(policy_device)
             self._acting = DeviceBridge(self.policy)
         self.storing_device = None if storing_device is None else torch.device(storing_device)
-        self.worker_idx = engine.get("worker_idx")
-        self.length = length
+        self.length, self.worker_idx = length, worker_idx
+        self.pre_collect_hook, self.post_collect_hook = pre_collect_hook, post_collect_hook
         self.exclude = exclude
         self.group_shape = shape
         self.groups_per_batch, self.total_groups = groups_per_batch, total_groups

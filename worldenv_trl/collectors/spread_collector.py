@@ -21,7 +21,7 @@ from worldenv_trl.splitmix import splitmix64
 __all__ = ["SpreadCollector"]
 
 
-_SHARES, _ROWS = 8, 16  # parts of a wave by default: so many at most, with so many rollouts at least
+_SHARES, _ROWS = 8, 24  # parts of a wave by default: so many at most, with so many rollouts at least
 
 
 class SpreadCollector(GroupCollector):
@@ -46,7 +46,7 @@ class SpreadCollector(GroupCollector):
     Keyword Args:
         create_env_fn: ``create_env_fn(groups)`` makes the same env for so many groups, with the same settings (seed,
             tasks, initial states or contexts) and on a device that the workers have.
-        shares: parts of a wave; by default one for every 16 rollouts, 8 at most, but enough for all workers. Never
+        shares: parts of a wave; by default one for every 24 rollouts, 8 at most, but enough for all workers. Never
             more than it has groups (deals of them to the tasks).
         waves_at_once: collected together, and yielded one after the other. The policy and :attr:`exclude` must not
             change between them, nor is the state between them one to continue from.
@@ -88,6 +88,8 @@ class SpreadCollector(GroupCollector):
                 f"{type(env).__name__} cannot say where its rollouts begin (draw_starts): collect them here"
             )
         groups, rollouts = self.group_shape
+        if total_groups > 0 and waves_at_once > 0:
+            waves_at_once = min(waves_at_once, total_groups // groups)
         if shares is None:
             enough = -(-workers.count // waves_at_once) if waves_at_once > 0 else 1
             shares = max(1, min(_SHARES, groups * rollouts // _ROWS), enough)
