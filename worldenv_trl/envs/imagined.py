@@ -13,6 +13,7 @@ from worldenv_trl.devices import to_device
 from worldenv_trl.envs.context_sampler import ContextSampler
 from worldenv_trl.envs.contexts import ContextOrder, check_contexts, context_keys
 from worldenv_trl.envs.imagined_specs import imagined_specs
+from worldenv_trl.envs.starts import GivenStarts
 from worldenv_trl.keys import (
     ACTION_DIM,
     CHUNK,
@@ -42,7 +43,7 @@ from worldenv_trl.world_models.noise_seeds import noise_seeds
 __all__ = ["ImaginedEnv"]
 
 
-class ImaginedEnv(EnvBase):
+class ImaginedEnv(GivenStarts, EnvBase):
     """Rollouts in a video world model (World-Env section 3.2): one decision, a chunk of actions, is one step.
 
     Forward kinematics predicts the hand's states over the chunk, the world model paints the frames. Reward is 0 and
@@ -174,7 +175,6 @@ class ImaginedEnv(EnvBase):
         self._seed = int(torch.randint(2**31, ()).item()) if seed is None else int(seed)
         self._order.seed(self._seed)
         self._resets.zero_()
-        self._starts: TensorDictBase | None = None  # of the next reset of all rows, if they were given
 
     # ------------------------------------------------------------------------------------------------- reset
 
@@ -193,21 +193,13 @@ class ImaginedEnv(EnvBase):
 
         Returns:
             TensorDict ``[G, N]``: ``place`` int64 in the contexts [K], and ``episode`` int64, by which the noise of a
-            row's rollouts differs. An env of the same contexts takes them, or those of some groups:
-            :meth:`begin_with`.
+            row's rollouts differs. For :meth:`begin_with`.
         """
         groups, rollouts = self.batch_size
         self._resets += 1
         place = torch.tensor(self._order.draw(groups), dtype=torch.int64).repeat_interleave(rollouts)
         starts = {"place": place.view(groups, rollouts), "episode": self._resets.cpu().view(groups, rollouts).clone()}
         return TensorDict(starts, self.batch_size)
-
-    def begin_with(self, starts: TensorDictBase) -> None:
-        """Lets the next reset of all rows begin with ``starts [G, N]``, of this env or another's :meth:`draw_starts`.
-        Groups are whole: a rollout's number in its group decides on its noise."""
-        if starts.batch_size != self.batch_size:
-            raise ValueError(f"starts must be {list(self.batch_size)}, got {list(starts.batch_size)}")
-        self._starts = starts
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
         groups, rollouts = self.batch_size
@@ -219,7 +211,7 @@ class ImaginedEnv(EnvBase):
         whole = [group for group in range(groups) if full[group] or not self._begun[group]]
         mask[whole] = True
         rows = mask.flatten().nonzero().squeeze(-1)
-        starts, self._starts = self._starts, None
+        starts = self._given_starts()
         if set_state or len(whole) < groups:
             starts = None
             self._resets[rows] += 1

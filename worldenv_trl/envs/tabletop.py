@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from worldenv_trl.context_ids import UNKNOWN_CONTEXT
 from worldenv_trl.envs.context_sampler import ContextSampler
 from worldenv_trl.envs.init_states import InitStates
+from worldenv_trl.envs.starts import GivenStarts
 from worldenv_trl.envs.tabletop_arguments import (
     check_cameras,
     check_counts,
@@ -59,7 +60,7 @@ class _Block:
     num_groups: int
 
 
-class TabletopEnv(EnvBase):
+class TabletopEnv(GivenStarts, EnvBase):
     """``num_envs`` copies of one or several tasks, stepped and rendered together. Batch-locked; honours ``_step``.
 
     A row's episode is a function of (seed, number of the episode, actions, what a ``context_sampler`` was told), bit
@@ -217,7 +218,6 @@ class TabletopEnv(EnvBase):
             check_whole("seed", seed, 0)
         self._seed = int(torch.randint(2**31, ()).item()) if seed is None else int(seed)
         self._episode = np.full(self.num_envs, -1)
-        self._starts: TensorDictBase | None = None  # of the next reset of all rows, if they were given
         for block in self._blocks:
             block.starts.seed(self._seed)
 
@@ -237,8 +237,8 @@ class TabletopEnv(EnvBase):
 
         Returns:
             TensorDict ``[num_envs]``: ``place`` int64, which of its task's initial states a row starts from, and
-            ``episode`` int64, its number. An env of the same tasks and states takes them, or those of some groups
-            that begin at a multiple of :attr:`groups_per_deal`: :meth:`begin_with`.
+            ``episode`` int64, its number. For :meth:`begin_with`, also of groups from a multiple of
+            :attr:`groups_per_deal` on.
         """
         self._episode[:] = self._episode.max(initial=-1) + 1  # rows reset together stay in step: groups share states
         place = np.zeros(self.num_envs, np.int64)
@@ -248,13 +248,6 @@ class TabletopEnv(EnvBase):
         return TensorDict(
             {"place": torch.from_numpy(place), "episode": torch.from_numpy(self._episode.copy())}, self.batch_size
         )
-
-    def begin_with(self, starts: TensorDictBase) -> None:
-        """Lets the next reset of all rows begin with ``starts [num_envs]``, of this env or another's
-        :meth:`draw_starts`."""
-        if starts.batch_size != self.batch_size:
-            raise ValueError(f"starts must be {list(self.batch_size)}, got {list(starts.batch_size)}")
-        self._starts = starts
 
     @property
     def groups_per_deal(self) -> int:
@@ -283,7 +276,7 @@ class TabletopEnv(EnvBase):
         self._check_open()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = np.ones(self.num_envs, bool) if mask is None else mask.reshape(-1).numpy()
-        starts, self._starts = self._starts, None
+        starts = self._given_starts()
         if set_state:
             self._episode[mask] = self._episode[mask].max(initial=-1) + 1 if mask.all() else self._episode[mask] + 1
         elif mask.all():
