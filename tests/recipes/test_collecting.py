@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import os
 import signal
 import socket
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from uuid import uuid4
 
 import pytest
 import torch
@@ -88,16 +91,32 @@ def test_a_run_is_continued_with_other_collectors(tiny):
 # ----------------------------------------------------------------------------------------------------- what it changes
 
 
-class Dealt(ProcessWorkers):
-    """Processes of which one is killed in the middle of the ``kill``-th wave."""
+class Alone:
+    """One worker, in this very process."""
 
-    def __init__(self, count: int, kill: int | None = None) -> None:
-        super().__init__(count)
-        self.waves, self.kill = 0, kill
+    count = 1
+
+    def put(self, value):
+        return SimpleNamespace(name=str(uuid4()), get=lambda: copy.deepcopy(value))
+
+    def map(self, function, arguments):
+        state = torch.get_rng_state()
+        results = [function(*each) for each in arguments]
+        torch.set_rng_state(state)
+        return results
+
+    def shutdown(self):
+        pass
+
+
+class Killed(ProcessWorkers):
+    """Processes, one of which is killed before their second wave."""
+
+    waves = 0
 
     def map(self, function, arguments):
         self.waves += 1
-        if self.waves == self.kill:
+        if self.waves == 2:
             os.kill(self.pids[0], signal.SIGKILL)
         return super().map(function, arguments)
 
@@ -107,7 +126,7 @@ def run(tiny):
     """An untrained run; workers are put into it."""
     learned = dataclasses.replace(tiny.post_train, iterations=2, groups=3, env="tabletop", probe_every=0)
     evaluated = dataclasses.replace(tiny.evaluate, episodes_per_task=3, num_envs=3)
-    settings = {"collectors": "process:1", "post_train": learned, "evaluate": evaluated}
+    settings = {"collectors": "process:1/3", "post_train": learned, "evaluate": evaluated}
     run = open_run(dataclasses.replace(tiny, **settings))
     torch.manual_seed(0)
     COMPACT.policy.make(run.config).save_pretrained(run.folder.checkpoint("sft"))
@@ -123,14 +142,16 @@ def with_workers(run, workers):
 
 def test_loop_reaches_the_same_weights_with_any_workers_one_of_them_killed(run):
     found = []
-    for workers in (Dealt(1), Dealt(2, kill=2)):
+    for workers in (Alone(), Killed(2)):
         with_workers(run, workers)
-        post_train(run, "sft", "post_train", "")
+        post_train(run, "sft", "post_train", "", returns_of=lambda wave: wave[keys.CHUNK][:, :, 0].mean((-2, -1)))
         (file,) = Path(run.folder.checkpoint("post_train")).glob("*.safetensors")
         found.append(load_file(file))
         recorded = read_rollouts(run.folder.rollouts("post_train_000"))
         assert recorded[keys.CONTEXT_ID].shape[:2] == (3, 2)
     assert workers.waves == 2
+    before = load_file(next(Path(run.folder.checkpoint("sft")).glob("*.safetensors")))
+    assert any(not torch.equal(value, found[0].get(name, value)) for name, value in before.items())  # it has learned
     assert found[0].keys() == found[1].keys()
     assert all(torch.equal(value, found[1][name]) for name, value in found[0].items())
 
