@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collecting import check_collectors
 from config import WorldEnvConfig
 from data_parallel import MODES
 from loggers import check_loggers
@@ -22,6 +23,11 @@ def check_shares(config: WorldEnvConfig, processes: int) -> None:
     ):
         if value % processes:
             raise ValueError(f"{name} must be a multiple of the {processes} processes that share it, got {value}")
+    if processes > 1 and config.collectors != "local":
+        raise ValueError(
+            f"{processes} processes of torchrun roll out their own groups: collectors must be local, got "
+            f"{config.collectors!r}; workers serve a single process"
+        )
 
 
 def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
@@ -119,6 +125,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     if config.max_steps < 1 or config.max_steps % config.chunk_length:
         raise ValueError(f"max_steps must be a multiple of chunk_length={config.chunk_length}, got {config.max_steps}")
     check_loggers(config.logger)
+    check_collectors(config)
     digests: dict[str, str] = {}
     for name in config.tasks:
         digest = load_task(name).digest

@@ -159,6 +159,10 @@ class WorldEnvConfig:
     The physics and the recordings stay on the CPU."""
     parallel: str = "ddp"
     """Of what torchrun's processes train together, in each a copy (``ddp``) or a share of the weights (``fsdp``)."""
+    collectors: str = "local"
+    """Who explores, imagines and evaluates: ``local``, this process; ``process:2``, two others of one thread each;
+    ``ray:4``, four of a Ray cluster (``RAY_ADDRESS``, or one of this machine): pip install worldenv_trl[ray].
+    ``ray:4/12`` cuts every wave into 12 shares: equal shares give equal rollouts, whoever collects them."""
     checkpoint_minutes: float = 2.0
     """Between two checkpoints of the running stage: at most so much is lost when it is killed."""
     logger: tuple[str, ...] = ()

@@ -44,7 +44,7 @@ def _rolled(run: Run, protocol: str, name: str, judge: Judge | None) -> dict[str
     """Success bool ``[episodes]`` of a policy in every task; writes its recording."""
     config, policy = run.config, run.policy(name)
     actor = laplace_actor(policy)
-    described = outcomes_env(run, config.tasks[0], "test", 1, judge, with_sim_state=True)
+    described = outcomes_env(config, config.tasks[0], "test", judge, 1, with_sim_state=True)
     taking_part = {"policy": policy} | ({} if judge is None else {"reflector": judge.reflector})
     about = recording(config, described, "evaluate", taking_part, policy=name, protocol=protocol)
     described.close()

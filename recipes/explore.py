@@ -5,15 +5,16 @@ Alone: ``python recipes/explore.py improve --run-dir runs/improve``.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from tqdm import tqdm
 
+from collecting import of_worker
 from physics import chunk_player, exploring_actor, recording, step_env
 from run import Run
 from stages import run_alone
 from worldenv_trl import keys
-from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.record import RolloutWriter
 
 
@@ -35,9 +36,11 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
     with RolloutWriter(folder.rollouts(target), **about, overwrite=True) as writer:
         for factor in settings.scale_factors:
             player = chunk_player(exploring_actor(config, model, max(factor, 1e-6)), config.chunk_length)
-            collector = GroupCollector(
+            collector = run.group_collector(
                 env,
                 player,
+                partial(step_env, of_worker(config), "train", **options),
+                steady=True,
                 groups_per_batch=settings.num_envs,
                 group_size=1,
                 total_groups=waves * settings.num_envs,

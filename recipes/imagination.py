@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import Compose, TransformedEnv
+from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
 from episodes import demonstrations_and_exploration
 from parts import PROPRIO
@@ -16,6 +18,7 @@ from run import Run
 from worldenv_trl import keys
 from worldenv_trl.devices import to_device
 from worldenv_trl.envs import ContextSampler, FramesAside, ImaginedEnv, Reflect
+from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.row_texts import row_texts
 from worldenv_trl.world_models import WorldModel
@@ -48,17 +51,44 @@ class Imagination:
         sampler: ContextSampler | None = None,
     ) -> TransformedEnv:
         """FK, action map, world model; the reflector gives the reward and stops; frames are not carried along."""
-        env = ImaginedEnv(
-            self.world_model,
+        groups, group_size = batch_size
+        make = self.makes(run, group_size, contexts, seed=seed)
+        return make(groups, sampler=sampler, transforms=[FramesAside(run.folder.scratch)])
+
+    def makes(
+        self, run: Run, group_size: int, contexts: TensorDict | None = None, *, seed: int
+    ) -> Callable[..., TransformedEnv]:
+        """``makes(...)(groups)`` is the same env for so many groups; frames are carried along."""
+        return partial(
+            _imagined,
+            self if contexts is None else replace(self, contexts=contexts),
             run.kinematics,
-            self.contexts if contexts is None else contexts,
-            batch_size=list(batch_size),
+            group_size,
             max_steps=run.config.max_steps,
             proprio=PROPRIO,
             seed=seed,
-            context_sampler=sampler,
         )
-        return TransformedEnv(env, Compose(Reflect(self.reflector, self.rule), FramesAside(run.folder.scratch)))
+
+
+def _imagined(
+    imagination: Imagination,
+    kinematics: ForwardKinematics,
+    group_size: int,
+    groups: int,
+    *,
+    sampler: ContextSampler | None = None,
+    transforms: Sequence[Transform] = (),
+    **options: Any,
+) -> TransformedEnv:
+    env = ImaginedEnv(
+        imagination.world_model,
+        kinematics,
+        imagination.contexts,
+        batch_size=[groups, group_size],
+        context_sampler=sampler,
+        **options,
+    )
+    return TransformedEnv(env, Compose(Reflect(imagination.reflector, imagination.rule), *transforms))
 
 
 def frames_aside(env: EnvBase) -> FramesAside | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -13,11 +14,12 @@ from torchrl.envs.transforms import TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
+from collecting import of_worker
+from config import WorldEnvConfig
 from imagination import Imagination
 from physics import tabletop
 from run import Run
 from worldenv_trl import keys
-from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import Reflect, chunked, context_id
 from worldenv_trl.policies import DeviceBridge
 from worldenv_trl.record import RolloutWriter
@@ -59,14 +61,18 @@ def physics_outcomes(
             "context_ids": [context_id(task_id, split, index) for index in indices],
         }
     num_envs = min(run.config.evaluate.num_envs, episodes)
-    env = outcomes_env(run, task, split, num_envs, judge, with_sim_state=writer is not None, **options)
+    options["with_sim_state"] = writer is not None
+    env = outcomes_env(run.config, task, split, judge, num_envs, **options)
     waves = -(-episodes // num_envs)
-    collector = GroupCollector(
+    collector = run.group_collector(
         env,
         DeviceBridge(actor),
+        partial(outcomes_env, of_worker(run.config), task, split, judge, **options),
+        steady=True,
         groups_per_batch=num_envs,
         group_size=1,
         total_groups=waves * num_envs,
+        exclude=("observation", ("next", "observation")) if writer is None else (),
         exploration_type=exploration_type,
     )
     outcome: dict[int, bool] = {}
@@ -83,13 +89,15 @@ def physics_outcomes(
     return torch.tensor([outcome[number] for number in sorted(outcome)][:episodes])
 
 
-def outcomes_env(run: Run, task: str, split: str, num_envs: int, judge: Judge | None, **options: Any) -> TransformedEnv:
+def outcomes_env(
+    config: WorldEnvConfig, task: str, split: str, judge: Judge | None, num_envs: int, **options: Any
+) -> TransformedEnv:
     """Initial states in order; the goal predicate ends an episode or, with a ``judge``, the reflector alone."""
     options = {"init_state_mode": "cycle", "terminate_on_success": judge is None} | options
-    env = tabletop(run.config, split, num_envs, [task], **options)
+    env = tabletop(config, split, num_envs, [task], **options)
     if judge is not None:
         env = TransformedEnv(env, Reflect(judge.reflector, judge.rule))
-    return chunked(env, run.config.chunk_length)
+    return chunked(env, config.chunk_length)
 
 
 def imagined_outcomes(
@@ -97,12 +105,16 @@ def imagined_outcomes(
 ) -> torch.Tensor:
     """Whether the reflector stops the greedy policy in imagination, bool ``[K]``, for each context in order."""
     # The same noise for every policy: probes are compared with one another.
-    env = imagination.env(run, [len(contexts), 1], contexts, seed=run.seed("probe"))
-    collector = GroupCollector(
+    seed = run.seed("probe")
+    env = imagination.env(run, [len(contexts), 1], contexts, seed=seed)
+    collector = run.group_collector(
         env,
         actor,
+        imagination.makes(run, 1, contexts, seed=seed),
+        steady=True,
         groups_per_batch=len(contexts),
         total_groups=len(contexts),
+        exclude=("frames", ("next", "frames"), "observation", ("next", "observation")),
         exploration_type=ExplorationType.DETERMINISTIC,
     )
     wave = next(iter(collector))[:, 0]

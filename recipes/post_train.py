@@ -119,6 +119,7 @@ def post_train(
             wave.update(ratios(wave, policy.in_keys, make_loss(policy)))
             _write(run, f"{target}_{iteration:03d}", about, wave, waves.aside)
         mean.update_parameters(policy)
+        waves.update_policy_weights_()
 
         metrics |= _wave_metrics(mine, returns, config.tasks)
         if sampler is not None:

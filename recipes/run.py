@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import torch
+from torchrl.envs import EnvBase
 
 import processes
+from collecting import spread_of, start_workers
 from config import WorldEnvConfig
 from parts import COMPACT, Parts
 from run_folder import RunFolder
 from seeds import stage_seed
+from worldenv_trl.collectors import GroupCollector, SpreadCollector, Workers
 from worldenv_trl.devices import choose_device
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.policies import Policy
@@ -39,6 +44,39 @@ class Run:
             ValueError: for one that does not exist.
         """
         return choose_device(processes.join(self.config.device))
+
+    @cached_property
+    def workers(self) -> Workers | None:
+        """Who collects rollouts for this process, started when first asked for; None where it does so itself.
+
+        Raises:
+            RuntimeError: if a Ray cluster has no room for them.
+        """
+        spread = spread_of(self.config.collectors)
+        return None if spread is None else start_workers(spread, self.device)
+
+    def close(self) -> None:
+        """Ends the workers, if there are any."""
+        workers = self.__dict__.pop("workers", None)
+        if workers is not None:
+            workers.shutdown()
+
+    def group_collector(
+        self, env: EnvBase, policy: Any, create_env_fn: Callable[[int], EnvBase], *, steady: bool, **options: Any
+    ) -> GroupCollector:
+        """Collects waves of ``env``: here or, with the envs that ``create_env_fn(groups)`` makes, by the workers.
+
+        Keyword Args:
+            steady: whether the policy stays from wave to wave, so that workers may collect several at once.
+            options: of :class:`~worldenv_trl.collectors.GroupCollector`.
+        """
+        spread = spread_of(self.config.collectors)
+        if spread is None or self.workers is None:
+            return GroupCollector(env, policy, **options)
+        spreads = options | {"workers": self.workers, "shares": spread.shares}
+        if steady:
+            spreads["waves_at_once"] = self.workers.count
+        return SpreadCollector(env, policy, create_env_fn=create_env_fn, **spreads)
 
     @cached_property
     def kinematics(self) -> ForwardKinematics:

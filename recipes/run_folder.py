@@ -29,8 +29,9 @@ from loggers import Loggers
 from worldenv_trl.report import machine_versions
 
 MIN_FREE_GB = 1.0
-FREE = {"run_dir", "num_threads", "device", "parallel", "checkpoint_minutes", "logger"}
-"""Settings of the machine at hand: a run may be continued with others. Only ``device`` changes noise and rounding."""
+FREE = {"run_dir", "num_threads", "device", "parallel", "collectors", "checkpoint_minutes", "logger"}
+"""Settings of the machine at hand: a run may be continued with others. Only ``device`` and ``collectors`` (``local`` or
+shares, and how many) change noise and rounding."""
 
 
 class RunFolder:

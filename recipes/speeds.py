@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,17 +40,18 @@ class Speed:
         return statistics.median(self.per_core_second)
 
 
-def core_seconds() -> float:
-    """Processor time of this process and, on Linux, of the processes it has started, all threads together."""
+def core_seconds(processes: Sequence[int] = ()) -> float:
+    """Processor time of this process and, on Linux, of the processes it has started and of ``processes``, by their
+    numbers; all threads together."""
     spent = time.process_time()
     tick = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
-    for listing in Path("/proc/self/task").glob("*/children"):
-        for child in listing.read_text().split():
-            try:
-                fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
-            except OSError:  # it has ended
-                continue
-            spent += (int(fields[11]) + int(fields[12])) / tick
+    started = [child for each in Path("/proc/self/task").glob("*/children") for child in each.read_text().split()]
+    for number in {*started, *map(str, processes)}:
+        try:
+            fields = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()
+        except OSError:  # it has ended
+            continue
+        spent += (int(fields[11]) + int(fields[12])) / tick
     return spent
 
 
@@ -60,18 +61,21 @@ def finish(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def speed(work: Callable[[], float], repeats: int, device: torch.device | None = None) -> Speed:
-    """Of ``work``, which returns how many units it did; it is done once more before, uncounted."""
+def speed(
+    work: Callable[[], float], repeats: int, device: torch.device | None = None, *, processes: Sequence[int] = ()
+) -> Speed:
+    """Of ``work``, which returns how many units it did; it is done once more before, uncounted. Others' ``processes``
+    that do it count, too: see :func:`core_seconds`."""
     device = torch.device("cpu") if device is None else device
     work()
     finish(device)
     wall, core = [], []
     for _ in range(repeats):
-        started, busy = time.perf_counter(), core_seconds()
+        started, busy = time.perf_counter(), core_seconds(processes)
         done = work()
         finish(device)
         wall.append(done / (time.perf_counter() - started))
-        core.append(done / max(core_seconds() - busy, 1e-9))
+        core.append(done / max(core_seconds(processes) - busy, 1e-9))
     return Speed(tuple(wall), tuple(core))
 
 

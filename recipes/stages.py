@@ -91,7 +91,7 @@ def run_alone(kind: str, work: Work, arguments: Sequence[str] | None = None, par
     """
     config = parse(sys.argv[1:] if arguments is None else arguments, work.__module__)
     run = open_run(config, parts)
-    with closing(run.folder.loggers):
+    with closing(run.folder.loggers), closing(run):
         rerun(kind, work, run)
 
 
@@ -122,8 +122,10 @@ def open_run(config: WorldEnvConfig, parts: Parts = COMPACT) -> Run:
         folder = RunFolder(config.run_dir)
         count = processes.size()
         processes.on_main(lambda: _check_and_open(config, parts, folder, count))
-    use_threads(config.num_threads)
-    return Run(config, folder, parts)
+        run = Run(config, folder, parts)
+        use_threads(config.num_threads)
+        run.workers  # noqa: B018 - a cluster without room says so now
+    return run
 
 
 def _check_and_open(config: WorldEnvConfig, parts: Parts, folder: RunFolder, count: int) -> None:

@@ -6,6 +6,8 @@ import os
 
 import torch
 
+OF_A_WORKER = 1
+"""Whatever cores its machine has, so that what it collects does not depend on them."""
 VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 

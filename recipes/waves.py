@@ -5,13 +5,15 @@ In imagination every process rolls out its groups; the physics is the main one's
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 import processes
+from collecting import of_worker
 from imagination import Imagination, frames_aside
 from physics import physics_waves_env
 from run import Run
@@ -47,38 +49,43 @@ class Waves:
     imagination: Imagination | None = None
 
     def __init__(self, run: Run, target: str, models: str, actor: LaplaceActor, sampler: ContextSampler | None) -> None:
-        settings = run.config.post_train
+        settings, size = run.config.post_train, run.config.post_train.group_size
         self._groups, self._read = settings.groups // processes.size(), [*actor.policy.in_keys, *_LEARNED_FROM]
-        options: dict[str, Any] = {"seed": run.seed(target, "env"), "sampler": sampler}
+        self._workers, seed = run.workers is not None, run.seed(target, "env")
         self.judges: dict[str, Any] = {}
+        make: Callable[..., EnvBase]
         if settings.env == "imagined":
             self.imagination = Imagination.load(run, models)
-            self.env = self.imagination.env(run, [self._groups, settings.group_size], **options)
+            self.env = self.imagination.env(run, [self._groups, size], seed=seed, sampler=sampler)
+            make = self.imagination.makes(run, size, seed=seed)
             self.judges = {"world_model": self.imagination.world_model, "reflector": self.imagination.reflector}
             mine = self._groups
         elif processes.is_main():
-            self.env = physics_waves_env(run.config, settings.groups, settings.group_size, **options)
+            self.env = physics_waves_env(run.config, settings.groups, size, seed=seed, sampler=sampler)
+            make = partial(physics_waves_env, of_worker(run.config), group_size=size, seed=seed)
             mine = settings.groups
         if self.env is not None:
-            self.collector = GroupCollector(
+            self.collector = run.group_collector(
                 self.env,
                 DeviceBridge(actor),
+                make,
+                steady=False,
                 groups_per_batch=mine,
                 total_groups=settings.iterations * mine,
-                group_size=settings.group_size,
+                group_size=size,
             )
 
     @property
     def aside(self) -> FramesAside | None:
-        """Where the frames of a wave that is recorded are kept."""
-        return None if self.env is None else frames_aside(self.env)
+        """Where the frames of a wave that is recorded are kept; those of workers come with their waves."""
+        return None if self.env is None or self._workers else frames_aside(self.env)
 
     def record_next(self, yes: bool) -> None:
         """Waves carry what is learned from; those that are recorded carry all, and their frames go to disk. The main
         process records, of imagination the groups that it rolled out."""
         if self.collector is None or self.env is None:
             return
-        self.collector.exclude = () if yes else [("next", "observation")]
+        self.collector.exclude = ["frames"] if yes else ["frames", ("next", "frames"), ("next", "observation")]
         if self.aside is not None:
             self.aside.keep = yes and processes.is_main()
 
@@ -106,6 +113,11 @@ class Waves:
         parts = [part.clone() for wave in lived for part in wave.select(*self._read, strict=False).split(self._groups)]
         mine = processes.dealt(parts)
         return (lived[0] if lived else mine), mine
+
+    def update_policy_weights_(self) -> None:
+        """Lets the next wave be collected by the policy as it is now."""
+        if self.collector is not None:
+            self.collector.update_policy_weights_()
 
     def shutdown(self) -> None:
         if self.collector is not None:

@@ -44,7 +44,7 @@ WORKS: dict[str, Work] = {
 def run_all(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     """Runs what is not finished yet, then prints the table and writes the plots and the report."""
     run = open_run(config, parts)
-    with closing(run.folder.loggers):
+    with closing(run.folder.loggers), closing(run):
         run_stages(run, WORKS)
         processes.on_main(lambda: _conclude(run))
 

@@ -223,3 +223,65 @@ def test_a_collector_goes_on_with_the_contexts_and_the_noise_that_come_next(make
             assert torch.equal(now["next", NOISE_SEED], later["next", NOISE_SEED])
     for each in (whole, first, second):
         each.shutdown()
+
+
+# ----------------------------------------------------------------------------------------------------- begun elsewhere
+
+
+@BOTH
+@pytest.mark.parametrize("sampled", [False, True])
+def test_an_env_begins_where_another_would_have(make, sampled):
+    sampler = (lambda: ContextSampler(seed=0)) if sampled else (lambda: None)
+    alone, draws, begins = make(4, 2, sampler()), make(4, 2, sampler()), make(4, 2, None)
+    for _ in range(3):
+        begins.begin_with(draws.draw_starts())
+        assert_same_rollout(alone, begins)
+
+
+@BOTH
+def test_some_groups_begin_as_they_would_have_among_all(make):
+    alone, draws, part = make(4, 2, None), make(4, 2, None), make(2, 2, None)
+    for _ in range(2):
+        whole = alone.reset()
+        part.begin_with(draws.draw_starts().reshape(4, 2)[2:].reshape(part.batch_size))
+        some, expected = part.reset(), whole.reshape(4, 2)[2:]
+        for key in (CONTEXT_ID, TASK_ID, STATE):
+            assert torch.equal(some[key].reshape(2, 2, -1), expected[key])
+
+
+def test_the_noise_of_some_imagined_groups_is_theirs_among_all():
+    alone, draws, part = (imagined(groups, 2, None) for groups in (4, 4, 2))
+    for _ in range(2):
+        torch.manual_seed(0)
+        whole = alone.rollout(2)
+        part.begin_with(draws.draw_starts()[2:])
+        assert torch.equal(part.rollout(2)["next", NOISE_SEED], whole["next", NOISE_SEED][2:])
+
+
+@BOTH
+def test_starts_count_as_a_reset_and_are_used_once(make):
+    env, drawn = make(4, 2, None), make(4, 2, None)
+    starts = drawn.draw_starts()
+    first = env.reset()[CONTEXT_ID]
+    assert torch.equal(env.reset()[CONTEXT_ID], drawn.reset()[CONTEXT_ID])  # the second of both
+    drawn.begin_with(starts)
+    assert torch.equal(drawn.reset()[CONTEXT_ID], first)
+    assert torch.equal(drawn.reset()["num_steps"], torch.zeros_like(first))
+
+
+@BOTH
+def test_starts_of_another_size_are_refused(make):
+    with pytest.raises(ValueError, match="starts must be"):
+        make(2, 2, None).begin_with(make(4, 2, None).draw_starts())
+
+
+def assert_same_rollout(one, other):
+    rollouts = []
+    for env in (one, other):
+        torch.manual_seed(0)
+        rollouts.append(env.rollout(2))
+    first, second = rollouts
+    for name in first.keys(True, True):
+        value = first.get(name)
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, second.get(name)), name

@@ -9,4 +9,9 @@ with warnings.catch_warnings():
     warnings.filterwarnings("ignore", message="Creating .*WeightUpdater")
     from worldenv_trl.collectors.group_collector import GroupCollector
 
-__all__ = ["GroupCollector"]
+from worldenv_trl.collectors.ray_workers import RayWorkers, check_ray
+from worldenv_trl.collectors.shares import check_shares
+from worldenv_trl.collectors.spread_collector import SpreadCollector
+from worldenv_trl.collectors.workers import ProcessWorkers, Workers
+
+__all__ = ["GroupCollector", "ProcessWorkers", "RayWorkers", "SpreadCollector", "Workers", "check_ray", "check_shares"]

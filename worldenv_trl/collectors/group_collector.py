@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,11 +18,42 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from worldenv_trl import keys
-from worldenv_trl.policies import Policy, check_pairing
+from worldenv_trl.devices import device_of
+from worldenv_trl.policies import DeviceBridge, Policy, check_pairing
 
 __all__ = ["GroupCollector"]
 
 _READ = (("next", "reward"), ("next", "done"))  # by the collector itself
+_TRAJ_IDS = ("collector", "traj_ids")
+# What TorchRL's engines hand to every collector: what would cut or mix groups, and what has no meaning for them.
+_REFUSED = (
+    "compact_obs",
+    "compile_policy",
+    "cudagraph_policy",
+    "init_random_frames",
+    "interruptor",
+    "max_frames_per_traj",
+    "postproc",
+    "replay_buffer",
+    "split_trajs",
+    "track_policy_version",
+    "trajs_per_batch",
+)
+_IGNORED = (
+    "auto_register_policy_transforms",
+    "extend_buffer",
+    "frames_per_batch",
+    "no_cuda_sync",
+    "reset_at_each_iter",
+    "reset_when_done",
+    "return_same_td",
+    "set_truncated",
+    "total_frames",
+    "traj_pool",
+    "trajs_per_write",
+    "trust_policy",
+    "use_buffers",
+)
 
 
 class GroupCollector(BaseCollector):
@@ -30,21 +62,35 @@ class GroupCollector(BaseCollector):
     Stock collectors reset rows as they finish, which leaves the groups of a leave-one-out baseline unfinished and
     biased. Here a wave resets all rows, rolls until every row is done, and marks what each rollout executed.
 
-    Where TorchRL's collectors count frames, this one counts groups; the rest of the interface is theirs.
+    Where TorchRL's collectors count frames, this one counts groups; the rest of the interface is theirs. So their
+    process and Ray engines replicate it, whole groups to each worker (see the package's README); a
+    :class:`~worldenv_trl.collectors.SpreadCollector` shares out the groups of one wave.
 
     Args:
-        env: batch ``[G, N]``, or a flat ``[G * N]`` with ``group_size=N`` (consecutive rows are a group).
+        create_env_fn: an env, or what makes one: batch ``[G, N]``, or a flat ``[G * N]`` with ``group_size=N``
+            (consecutive rows are a group).
         policy: the behaviour policy; it must not change while a batch is collected. Every
             :class:`~worldenv_trl.policies.Policy` in it is checked against the env.
 
     Keyword Args:
         groups_per_batch: groups in each yielded batch, a multiple of ``G``.
         total_groups: stop after so many; -1 never stops.
-        group_size: see ``env``.
+        group_size: see ``create_env_fn``.
         max_decisions: longest rollout in env steps (decisions, for a chunked env); default 10,000.
         exploration_type: of the policy; ``DETERMINISTIC`` is greedy.
         exclude: entries that no one reads, left out of every step as soon as it is over; none by default. See
             :attr:`exclude`.
+        policy_factory: makes the policy, instead of ``policy``.
+        policy_device: where the policy acts, on a copy if it is elsewhere: :meth:`update_policy_weights_` brings the
+            copy up to date. Where the policy is when None.
+        env_device: where the env is moved; where it is when None.
+        storing_device: where batches are yielded; the env's when None.
+        device: of the three above that are None.
+        create_env_kwargs: of ``create_env_fn``.
+        length: decisions of every batch, which are padded outside the mask and numbered in ``("collector",
+            "traj_ids")``: engines stack the batches of their workers. As long as the longest rollout when None.
+        worker_idx, pre_collect_hook, post_collect_hook, engine: what TorchRL's engines pass to every collector. Options
+            that would cut or mix groups are refused, those without a meaning for groups are ignored.
 
     Yields:
         TensorDict ``[groups, N, T]`` as ``env.rollout`` writes it, with ``("collector", "mask")`` bool [groups, N, T]:
@@ -52,8 +98,9 @@ class GroupCollector(BaseCollector):
         at each of its entries.
 
     Raises:
-        ValueError: if sizes do not divide or are below 1, a policy was trained for another env, or ``exclude`` names
-            reward or done flags.
+        ValueError: if sizes do not divide or are below 1, a policy was trained for another env, ``exclude`` names
+            reward or done flags, or an engine asks for what would cut groups.
+        TypeError: for an unknown option.
 
     Examples:
         >>> from worldenv_trl.envs import TabletopEnv, chunked
@@ -68,9 +115,11 @@ class GroupCollector(BaseCollector):
         >>> collector.shutdown()
     """
 
+    _use_buffers = False  # a batch is a new TensorDict: engines must not wait for the first one to change
+
     def __init__(
         self,
-        env: EnvBase,
+        create_env_fn: EnvBase | Callable[..., EnvBase],
         policy: TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase] | None = None,
         *,
         groups_per_batch: int,
@@ -79,8 +128,40 @@ class GroupCollector(BaseCollector):
         max_decisions: int | None = None,
         exploration_type: ExplorationType = ExplorationType.RANDOM,
         exclude: Sequence[NestedKey] = (),
+        policy_factory: Callable[[], Any] | None = None,
+        policy_device: torch.device | str | None = None,
+        env_device: torch.device | str | None = None,
+        storing_device: torch.device | str | None = None,
+        create_env_kwargs: Mapping[str, Any] | None = None,
+        device: torch.device | str | None = None,
+        length: int | None = None,
+        worker_idx: int | None = None,
+        pre_collect_hook: Callable[[], None] | None = None,
+        post_collect_hook: Callable[[TensorDictBase], None] | None = None,
+        **engine: Any,
     ) -> None:
         super().__init__()
+        unknown = sorted(engine.keys() - {*_REFUSED, *_IGNORED})
+        if unknown:
+            raise TypeError(f"GroupCollector has no option {unknown[0]!r}")
+        refused = [name for name in _REFUSED if engine.get(name) not in (None, False, 0, -1)]
+        if refused:
+            raise ValueError(f"groups are collected whole: {refused[0]}={engine[refused[0]]!r} would cut or mix them")
+        if policy is not None and policy_factory is not None:
+            raise ValueError("give policy or policy_factory, not both")
+        env: Any = create_env_fn
+        if isinstance(env, list | tuple):  # TorchRL's Ray engine gives every collector a list
+            if len(env) != 1:
+                raise ValueError(f"a GroupCollector steps one env, got {len(env)}: give it more groups instead")
+            env = env[0]
+        if not isinstance(env, EnvBase):
+            env = env(**dict(create_env_kwargs or {}))
+        env_device = device if env_device is None else env_device
+        policy_device = device if policy_device is None else policy_device
+        storing_device = device if storing_device is None else storing_device
+        if env_device is not None and env.device != torch.device(env_device):
+            env = env.to(env_device)
+        policy = policy if policy_factory is None else policy_factory()
         shape = tuple(env.batch_size)
         if len(shape) == 1:
             size = 1 if group_size is None else group_size
@@ -100,7 +181,18 @@ class GroupCollector(BaseCollector):
         for module in policy.modules() if isinstance(policy, nn.Module) else ():
             if isinstance(module, Policy):
                 check_pairing(module, env)
-        self.env, self.policy = env, policy
+        if length is not None and length < 1:
+            raise ValueError(f"length must be at least 1, got {length}")
+        self.env = env
+        self._source = self.policy = policy
+        self._acting: Any = policy
+        if policy_device is not None and isinstance(policy, nn.Module):
+            if device_of(policy) != torch.device(policy_device):
+                self.policy = copy.deepcopy(policy).to(policy_device)
+            self._acting = DeviceBridge(self.policy)
+        self.storing_device = None if storing_device is None else torch.device(storing_device)
+        self.length, self.worker_idx = length, worker_idx
+        self.pre_collect_hook, self.post_collect_hook = pre_collect_hook, post_collect_hook
         self.exclude = exclude
         self.group_shape = shape
         self.groups_per_batch, self.total_groups = groups_per_batch, total_groups
@@ -139,6 +231,9 @@ class GroupCollector(BaseCollector):
             raise RuntimeError("this collector is endless (total_groups=-1): it has no length")
         return self.total_groups // self.groups_per_batch
 
+    def __bool__(self) -> bool:
+        return True  # whoever asks whether there is a collector shall not get its length
+
     def _batch(self) -> TensorDictBase:
         if self.closed:
             raise RuntimeError("this collector was shut down: make a new one")
@@ -146,10 +241,20 @@ class GroupCollector(BaseCollector):
             self.pre_collect_hook()
         waves = [self._wave() for _ in range(self.groups_per_batch // self.group_shape[0])]
         length = max(wave.shape[-1] for wave in waves)
-        batch = waves[0] if len(waves) == 1 else TensorDict.cat([_padded(wave, length) for wave in waves], 0)
+        if self.length is not None and length > self.length:
+            raise ValueError(f"length must be at least that of the longest rollout, {length}, got {self.length}")
+        batch = joined(waves, length if self.length is None else self.length)
+        if self.length is not None:
+            first = self._groups * batch.shape[1]
+            numbers = torch.arange(first, first + batch.shape[:2].numel(), device=batch.device).view(
+                *batch.shape[:2], 1
+            )
+            batch[_TRAJ_IDS] = numbers.expand(batch.shape).contiguous()
         self._groups += self.groups_per_batch
         self._frames += int(batch[keys.MASK].sum())
         self._iter += 1
+        if self.storing_device is not None:
+            batch = batch.to(self.storing_device)
         if self.post_collect_hook is not None:
             self.post_collect_hook(batch)
         return batch
@@ -163,7 +268,7 @@ class GroupCollector(BaseCollector):
                 module.training = False
             with set_exploration_type(self.exploration_type), _leaving_out(self.env, self.exclude):
                 rollout = self.env.rollout(
-                    self.max_decisions, self.policy, break_when_any_done=False, break_when_all_done=True
+                    self.max_decisions, self._acting, break_when_any_done=False, break_when_all_done=True
                 )
         finally:
             for module in training:
@@ -182,12 +287,14 @@ class GroupCollector(BaseCollector):
     ) -> None:
         """Loads weights into the behaviour policy: a module, a state dict or a TensorDict of parameters.
 
-        Without an argument it does nothing: the collector calls the very policy it was given.
+        Without an argument they are those of the policy that was given, which is the very one that acts unless
+        ``policy_device`` made a copy of it.
         """
         given = [source for source in (policy_or_weights, weights, policy) if source is not None]
         if len(given) > 1:
             raise ValueError("give the weights once: positionally, as weights=..., or as policy=...")
-        if not given or given[0] is self.policy:
+        given = given or [self._source]
+        if given[0] is self.policy:
             return
         if not isinstance(self.policy, nn.Module):
             raise ValueError("the policy is a function: it has no weights to update")
@@ -248,6 +355,12 @@ def _leaving_out(env: EnvBase, names: tuple[NestedKey, ...]) -> Iterator[None]:
         del env._post_step_mdp_hooks  # the class's shows again
         if own:
             env._post_step_mdp_hooks = before
+
+
+def joined(waves: Sequence[TensorDictBase], length: int) -> TensorDictBase:
+    """Waves ``[G, N, T]`` as one ``[sum of G, N, length]``."""
+    waves = [_padded(wave, length) for wave in waves]
+    return waves[0] if len(waves) == 1 else TensorDict.cat(waves, 0)
 
 
 def _padded(wave: TensorDictBase, length: int) -> TensorDictBase:

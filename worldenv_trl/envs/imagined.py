@@ -13,6 +13,7 @@ from worldenv_trl.devices import to_device
 from worldenv_trl.envs.context_sampler import ContextSampler
 from worldenv_trl.envs.contexts import ContextOrder, check_contexts, context_keys
 from worldenv_trl.envs.imagined_specs import imagined_specs
+from worldenv_trl.envs.starts import GivenStarts
 from worldenv_trl.keys import (
     ACTION_DIM,
     CHUNK,
@@ -43,7 +44,7 @@ from worldenv_trl.world_models.noise_seeds import noise_seeds
 __all__ = ["ImaginedEnv"]
 
 
-class ImaginedEnv(EnvBase):
+class ImaginedEnv(GivenStarts, EnvBase):
     """Rollouts in a video world model (World-Env section 3.2): one decision, a chunk of actions, is one step.
 
     Forward kinematics predicts the hand's states over the chunk, the world model paints the frames. Reward is 0 and
@@ -188,6 +189,19 @@ class ImaginedEnv(EnvBase):
         self._order.load_state_dict(state["order"])
         self._resets.copy_(state["resets"])
 
+    def draw_starts(self) -> TensorDict:
+        """Draws what the next reset of all rows would begin with, and counts as that reset; nothing is loaded.
+
+        Returns:
+            TensorDict ``[G, N]``: ``place`` int64 in the contexts [K], and ``episode`` int64, by which the noise of a
+            row's rollouts differs. For :meth:`begin_with`.
+        """
+        groups, rollouts = self.batch_size
+        self._resets += 1
+        place = torch.tensor(own_items(self._order.draw, groups), dtype=torch.int64).repeat_interleave(rollouts)
+        starts = {"place": place.view(groups, rollouts), "episode": self._resets.cpu().view(groups, rollouts).clone()}
+        return TensorDict(starts, self.batch_size)
+
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
         groups, rollouts = self.batch_size
         mask = tensordict.get("_reset", None) if tensordict is not None else None
@@ -198,15 +212,24 @@ class ImaginedEnv(EnvBase):
         whole = [group for group in range(groups) if full[group] or not self._begun[group]]
         mask[whole] = True
         rows = mask.flatten().nonzero().squeeze(-1)
-        self._resets[rows] += 1
+        starts = self._given_starts()
+        if set_state or len(whole) < groups:
+            starts = None
+            self._resets[rows] += 1
+        else:
+            starts = self.draw_starts() if starts is None else starts
+            self._resets.copy_(starts["episode"].flatten())
         self._steps[rows] = 0
         self._decisions[rows] = 0
         if set_state:
             self._load(rows, *self._given(tensordict, rows))
             self._episode[rows] = 0
         else:
-            drawn = own_items(self._order.draw, len(whole))
-            index = torch.tensor(drawn, dtype=torch.int64).repeat_interleave(rollouts)
+            if starts is None:
+                drawn = own_items(self._order.draw, len(whole))
+                index = torch.tensor(drawn, dtype=torch.int64).repeat_interleave(rollouts)
+            else:
+                index = starts["place"].flatten()
             fresh = torch.tensor(whole, dtype=torch.int64)[:, None] * rollouts + torch.arange(rollouts)
             text = [self._instructions[i] for i in index.tolist()]
             self._load(fresh.flatten().to(self.device), self._contexts[index.to(self._contexts.device)], text)

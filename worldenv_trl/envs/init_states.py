@@ -104,13 +104,20 @@ class InitStates:
         return numbers[0], states[0]
 
     def draw_together(self, numbers: Sequence[int]) -> tuple[list[int], np.ndarray]:
-        """Context ids and states ``[n, S]`` of episodes that begin together: a sampler draws no state twice for them if
-        it can be. Equal numbers are one episode's."""
+        """Context ids and states ``[n, S]`` of episodes that begin together; see :meth:`places`."""
+        return self.at(self.places(numbers))
+
+    def places(self, numbers: Sequence[int]) -> list[int]:
+        """Which of the states episodes that begin together start from: a sampler draws none twice for them if it can
+        be. Equal numbers are one episode's."""
         if self.sampler is not None:
             new = sorted(set(numbers) - self._sampled.keys())
             self._sampled.update(zip(new, self.sampler.draw(self.context_ids, len(new)), strict=True))
-        places = [self._place(number) for number in numbers]
-        return [self.context_ids[place] for place in places], self.states[places]
+        return [self._place(number) for number in numbers]
+
+    def at(self, places: Sequence[int]) -> tuple[list[int], np.ndarray]:
+        """Context ids and states ``[n, S]`` at some places."""
+        return [self.context_ids[place] for place in places], self.states[list(places)]
 
     def _place(self, number: int) -> int:
         """Of the ``number``-th episode's state."""

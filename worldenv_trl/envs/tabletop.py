@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from worldenv_trl.context_ids import UNKNOWN_CONTEXT
 from worldenv_trl.envs.context_sampler import ContextSampler
 from worldenv_trl.envs.init_states import InitStates
+from worldenv_trl.envs.starts import GivenStarts
 from worldenv_trl.envs.tabletop_arguments import (
     check_cameras,
     check_counts,
@@ -59,7 +60,7 @@ class _Block:
     num_groups: int
 
 
-class TabletopEnv(EnvBase):
+class TabletopEnv(GivenStarts, EnvBase):
     """``num_envs`` copies of one or several tasks, stepped and rendered together. Batch-locked; honours ``_step``.
 
     A row's episode is a function of (seed, number of the episode, actions, what a ``context_sampler`` was told), bit
@@ -231,6 +232,28 @@ class TabletopEnv(EnvBase):
         for block, starts in zip(self._blocks, state["starts"], strict=True):
             block.starts.load_state_dict(starts)
 
+    def draw_starts(self) -> TensorDict:
+        """Draws what the next reset of all rows would begin with, and counts as that reset; nothing is simulated.
+
+        Returns:
+            TensorDict ``[num_envs]``: ``place`` int64, which of its task's initial states a row starts from, and
+            ``episode`` int64, its number. For :meth:`begin_with`, also of groups from a multiple of
+            :attr:`groups_per_deal` on.
+        """
+        self._episode[:] = self._episode.max(initial=-1) + 1  # rows reset together stay in step: groups share states
+        place = np.zeros(self.num_envs, np.int64)
+        for block in self._blocks:
+            order = self._episode[block.rows] * block.num_groups + block.groups
+            place[block.rows] = block.starts.places(order.tolist())
+        return TensorDict(
+            {"place": torch.from_numpy(place), "episode": torch.from_numpy(self._episode.copy())}, self.batch_size
+        )
+
+    @property
+    def groups_per_deal(self) -> int:
+        """Groups are dealt to the tasks in turn: one to each is a deal."""
+        return len(self.tasks)
+
     @property
     def num_envs(self) -> int:
         return self.batch_size[0]
@@ -253,15 +276,27 @@ class TabletopEnv(EnvBase):
         self._check_open()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = np.ones(self.num_envs, bool) if mask is None else mask.reshape(-1).numpy()
-        # Rows reset together stay in step, so that the rows of a group share their initial states.
-        self._episode[mask] = self._episode[mask].max(initial=-1) + 1 if mask.all() else self._episode[mask] + 1
+        starts = self._given_starts()
+        if set_state:
+            self._episode[mask] = self._episode[mask].max(initial=-1) + 1 if mask.all() else self._episode[mask] + 1
+        elif mask.all():
+            starts = self.draw_starts() if starts is None else starts
+            self._episode[:] = starts["episode"].numpy()
+        else:
+            self._episode[mask] += 1
+            starts = None
         self._steps[mask], self._terminated[mask], self._truncated[mask] = 0, False, False
         for block in self._blocks:
             local = np.flatnonzero(mask[block.rows])
             if not len(local):
                 continue
             rows = block.rows[local]
-            numbers, states = self._given(tensordict, block, rows) if set_state else self._drawn(block, local)
+            if set_state:
+                numbers, states = self._given(tensordict, block, rows)
+            elif starts is not None:
+                numbers, states = block.starts.at(starts["place"][torch.from_numpy(rows)].tolist())
+            else:
+                numbers, states = self._drawn(block, local)
             block.scene.reset(local, states)
             self._context[rows, 0] = numbers
         self._read(mask)
@@ -269,7 +304,7 @@ class TabletopEnv(EnvBase):
         return self._observe()
 
     def _drawn(self, block: _Block, local: np.ndarray) -> tuple[list[int], np.ndarray]:
-        """The next initial states of a task's rows."""
+        """The next initial states of some of a task's rows."""
         order = self._episode[block.rows[local]] * block.num_groups + block.groups[local]
         return block.starts.draw_together(order.tolist())
 
