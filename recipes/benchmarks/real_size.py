@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TypeVar
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the recipes beside this folder
-sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import torch
 import tyro

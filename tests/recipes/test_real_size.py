@@ -11,7 +11,7 @@ from torch import nn
 
 import show_scenes
 
-sys.path.insert(0, str(Path(show_scenes.__file__).parent / "benchmarks"))
+sys.path.append(str(Path(show_scenes.__file__).parent / "benchmarks"))  # last: some of its names are recipes, too
 
 import real_size
 from real_size_row import PeakMemory, Row, costs
