@@ -34,7 +34,7 @@ from physics import chunk_player, exploring_actor, physics_waves_env, step_env, 
 from run import Run
 from run_folder import RunFolder
 from speeds import Speed, speed
-from threads import use_threads
+from threads import OF_A_WORKER, use_threads
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.policies import DeviceBridge
@@ -61,7 +61,7 @@ class Benchmark:
 def settings_of(settings: Benchmark, collectors: str) -> WorldEnvConfig:
     """A run of that size."""
     return WorldEnvConfig(
-        num_threads=1,
+        num_threads=OF_A_WORKER,
         device="cpu",
         collectors=collectors,
         explore=Explore(num_envs=settings.num_envs),

@@ -23,7 +23,7 @@ def processes():
 
 
 def test_processes_give_what_this_process_gives(processes):
-    assert_equal(waves_of(spread(processes)), waves_of(spread(Here())))
+    assert_equal(waves_of(spread(processes)), waves_of(spread(Here(2))))
     assert len(processes.pids) == 2 and os.getpid() not in processes.pids
 
 
@@ -31,7 +31,7 @@ def test_a_worker_killed_inside_a_rollout_is_replaced_and_its_groups_are_collect
     before = set(processes.pids)
     killed = waves_of(spread(processes, make_policy(marker=tmp_path / "died")))
     assert (tmp_path / "died").exists() and before.isdisjoint(processes.pids)
-    assert_equal(killed, waves_of(spread(Here())))
+    assert_equal(killed, waves_of(spread(Here(2))))
 
 
 def test_a_worker_killed_between_waves_is_replaced(processes):
@@ -39,7 +39,7 @@ def test_a_worker_killed_between_waves_is_replaced(processes):
     waves = [collector.next()]
     os.kill(processes.pids[0], signal.SIGKILL)
     waves += waves_of(collector)
-    assert_equal(waves, waves_of(spread(Here())))
+    assert_equal(waves, waves_of(spread(Here(2))))
 
 
 def test_work_that_kills_every_worker_ends_in_one_line(processes, tmp_path):

@@ -31,7 +31,7 @@ def cluster():
 
 
 def test_ray_gives_what_this_process_gives(cluster):
-    assert_equal(waves_of(spread(cluster)), waves_of(spread(Here())))
+    assert_equal(waves_of(spread(cluster)), waves_of(spread(Here(2))))
     assert os.getpid() not in cluster.pids
 
 
@@ -39,7 +39,7 @@ def test_an_actor_killed_inside_a_rollout_is_replaced_and_its_groups_are_collect
     before = set(cluster.pids)
     killed = waves_of(spread(cluster, make_policy(marker=tmp_path / "died")))
     assert (tmp_path / "died").exists() and len(before & set(cluster.pids)) == 1
-    assert_equal(killed, waves_of(spread(Here())))
+    assert_equal(killed, waves_of(spread(Here(2))))
 
 
 def test_an_actor_killed_between_waves_is_replaced(cluster):
@@ -47,7 +47,7 @@ def test_an_actor_killed_between_waves_is_replaced(cluster):
     waves = [collector.next()]
     os.kill(cluster.pids[0], signal.SIGKILL)
     waves += waves_of(collector)
-    assert_equal(waves, waves_of(spread(Here())))
+    assert_equal(waves, waves_of(spread(Here(2))))
 
 
 def test_work_that_kills_every_actor_ends_in_one_line(cluster, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import itertools
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -48,7 +49,8 @@ def seen(monkeypatch, tiny):
 
     monkeypatch.setattr(Run, "policy", lambda *_: torch.nn.Identity())
     monkeypatch.setattr(explore_stage, "step_env", stop)
-    monkeypatch.setattr(post_train_stage, "exploring_actor", lambda *_: None)
+    actor = SimpleNamespace(policy=SimpleNamespace(in_keys=[]))
+    monkeypatch.setattr(post_train_stage, "exploring_actor", lambda *_: actor)
     monkeypatch.setattr(torch.nn.Identity, "post_training_parameters", lambda *_: {}, raising=False)
     monkeypatch.setattr(imagination.Imagination, "load", classmethod(lambda *_: imagination.Imagination(*[None] * 4)))
     monkeypatch.setattr(imagination.Imagination, "env", stop)

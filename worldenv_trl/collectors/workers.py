@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import pickle
 import signal
 import tempfile
 import threading
@@ -94,7 +93,7 @@ class ProcessWorkers:
                 for place, each in waiting.items():
                     futures[self._started().submit(_call, cloudpickle.dumps((function, each)))] = place
                 for future in as_completed(futures):
-                    results[futures[future]] = pickle.loads(future.result())
+                    results[futures[future]] = cloudpickle.loads(future.result())
             except BrokenProcessPool as error:
                 self._end()
                 attempts = 1 if results.keys() & waiting.keys() else attempts + 1
@@ -161,7 +160,7 @@ def _begin() -> None:
 def _call(packed: bytes) -> bytes:
     function, arguments = cloudpickle.loads(packed)
     # Bytes, not tensors in shared memory: those of a process that dies would be lost on the way.
-    return pickle.dumps(function(*arguments))
+    return cloudpickle.dumps(function(*arguments))
 
 
 def _end_with(parent: BaseProcess) -> None:
