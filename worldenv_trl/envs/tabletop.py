@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from torchrl.envs import EnvBase
 from worldenv_trl.context_ids import UNKNOWN_CONTEXT
 from worldenv_trl.envs.context_sampler import ContextSampler
 from worldenv_trl.envs.init_states import InitStates
-from worldenv_trl.envs.starts import GivenStarts
 from worldenv_trl.envs.tabletop_arguments import (
     check_cameras,
     check_counts,
@@ -28,6 +26,7 @@ from worldenv_trl.envs.tabletop_arguments import (
     tasks_of,
 )
 from worldenv_trl.envs.tabletop_specs import tabletop_specs
+from worldenv_trl.envs.tabletop_starts import Block, TabletopStarts
 from worldenv_trl.keys import (
     ACTION,
     ACTION_DIM,
@@ -49,18 +48,7 @@ from worldenv_trl.scenes.simulation import measured_states, step_together
 __all__ = ["TabletopEnv"]
 
 
-@dataclass
-class _Block:
-    """The rows of one task."""
-
-    scene: SceneBatch
-    starts: InitStates
-    rows: np.ndarray  # [m] rows of the env
-    groups: np.ndarray  # [m] which of the task's groups a row belongs to
-    num_groups: int
-
-
-class TabletopEnv(GivenStarts, EnvBase):
+class TabletopEnv(TabletopStarts, EnvBase):
     """``num_envs`` copies of one or several tasks, stepped and rendered together. Batch-locked; honours ``_step``.
 
     A row's episode is a function of (seed, number of the episode, actions, what a ``context_sampler`` was told), bit
@@ -171,7 +159,7 @@ class TabletopEnv(GivenStarts, EnvBase):
         threads = min(min(2, torch.get_num_threads()) if num_threads is None else num_threads, num_envs)
         self._executor = ThreadPoolExecutor(threads) if len(tasks) > 1 and threads > 1 else None
         self._pool = RendererPool(threads) if cameras else None
-        self._blocks: list[_Block] = []
+        self._blocks: list[Block] = []
         for slot, (item, choice) in enumerate(zip(tasks, starts, strict=True)):
             rows = np.flatnonzero(group % len(tasks) == slot)
             # Many rows of a task are shared among the threads; tasks of few rows are dealt to them whole.
@@ -180,7 +168,7 @@ class TabletopEnv(GivenStarts, EnvBase):
                 item, len(rows), image_size=image_size, cameras=cameras, num_threads=inside, pool=self._pool
             )
             groups = group[rows] // len(tasks)
-            self._blocks.append(_Block(scene, choice, rows, groups, int(groups.max()) + 1))
+            self._blocks.append(Block(scene, choice, rows, groups, int(groups.max()) + 1))
         self._make_buffers(max_steps)
         self._make_specs()
         self._set_seed(seed)
@@ -220,39 +208,6 @@ class TabletopEnv(GivenStarts, EnvBase):
         self._episode = np.full(self.num_envs, -1)
         for block in self._blocks:
             block.starts.seed(self._seed)
-
-    def order_state(self) -> dict[str, Any]:
-        """What decides which initial states the next reset of all rows begins with; take it between waves."""
-        starts = [block.starts.state_dict() for block in self._blocks]
-        return {"seed": self._seed, "episode": torch.tensor(self._episode), "starts": starts}
-
-    def load_order_state(self, state: dict[str, Any]) -> None:
-        """Lets the next reset of all rows begin as it would have where :meth:`order_state` gave ``state``."""
-        self._seed, self._episode = state["seed"], state["episode"].numpy().copy()
-        for block, starts in zip(self._blocks, state["starts"], strict=True):
-            block.starts.load_state_dict(starts)
-
-    def draw_starts(self) -> TensorDict:
-        """Draws what the next reset of all rows would begin with, and counts as that reset; nothing is simulated.
-
-        Returns:
-            TensorDict ``[num_envs]``: ``place`` int64, which of its task's initial states a row starts from, and
-            ``episode`` int64, its number. For :meth:`begin_with`, also of groups from a multiple of
-            :attr:`groups_per_deal` on.
-        """
-        self._episode[:] = self._episode.max(initial=-1) + 1  # rows reset together stay in step: groups share states
-        place = np.zeros(self.num_envs, np.int64)
-        for block in self._blocks:
-            order = self._episode[block.rows] * block.num_groups + block.groups
-            place[block.rows] = block.starts.places(order.tolist())
-        return TensorDict(
-            {"place": torch.from_numpy(place), "episode": torch.from_numpy(self._episode.copy())}, self.batch_size
-        )
-
-    @property
-    def groups_per_deal(self) -> int:
-        """Groups are dealt to the tasks in turn: one to each is a deal."""
-        return len(self.tasks)
 
     @property
     def num_envs(self) -> int:
@@ -302,42 +257,6 @@ class TabletopEnv(GivenStarts, EnvBase):
         self._read(mask)
         self._reward[mask] = 0
         return self._observe()
-
-    def _drawn(self, block: _Block, local: np.ndarray) -> tuple[list[int], np.ndarray]:
-        """The next initial states of some of a task's rows."""
-        order = self._episode[block.rows[local]] * block.num_groups + block.groups[local]
-        return block.starts.draw_together(order.tolist())
-
-    def _given(
-        self, tensordict: TensorDictBase | None, block: _Block, rows: np.ndarray
-    ) -> tuple[list[int], np.ndarray]:
-        """The states of a task's ``rows`` that the caller put into the reset's tensordict."""
-        given = TensorDict() if tensordict is None else tensordict
-        sim_state, numbers, task = (given.get(key, None) for key in (SIM_STATE, CONTEXT_ID, TASK_ID))
-        if sim_state is None and numbers is None:
-            raise ValueError(f"reset(set_state=True) needs {SIM_STATE!r} or {CONTEXT_ID!r} in its tensordict")
-        if task is not None and (task.reshape(-1).numpy()[rows] != block.starts.task_id).any():
-            raise ValueError(
-                f"reset(set_state=True): rows {rows.tolist()} run {block.scene.task.name}, {TASK_ID} says otherwise"
-            )
-        numbers = [UNKNOWN_CONTEXT] * len(rows) if numbers is None else numbers.reshape(-1).numpy()[rows].tolist()
-        if sim_state is None:
-            return numbers, np.stack([block.starts.find(number) for number in numbers])
-        length = block.scene.batch.nstate
-        if sim_state.shape[:-1] != self.batch_size or sim_state.shape[-1] < length:
-            raise ValueError(
-                f"{SIM_STATE} must be [{self.num_envs}, {self._sim_size}] for {block.scene.task.name}, "
-                f"got {list(sim_state.shape)}"
-            )
-        steps = given.get(NUM_STEPS, None)
-        if steps is not None:
-            steps = steps.reshape(-1, 1).numpy()[rows]
-            if (steps >= self._limit[rows]).any():
-                raise ValueError(
-                    f"a state at {NUM_STEPS}={int(steps.max())} is past max_steps={int(self._limit[rows].min())}"
-                )
-            self._steps[rows] = steps
-        return numbers, sim_state.numpy().astype(np.float64, copy=False)[rows, :length]
 
     # ------------------------------------------------------------------------------------------------- step
 
@@ -398,7 +317,7 @@ class TabletopEnv(GivenStarts, EnvBase):
             for buffer, image in zip(self._images.values(), images.values(), strict=True):
                 buffer[block.rows[local]] = image
 
-    def _read_state(self, parts: list[tuple[_Block, np.ndarray]]) -> None:
+    def _read_state(self, parts: list[tuple[Block, np.ndarray]]) -> None:
         scenes = [block.scene for block, _ in parts]
         if self.proprio == "measured":
             states = np.split(measured_states(scenes), np.cumsum([scene.num_envs for scene in scenes])[:-1])
