@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import ParamSpec
 
 import worldenv_trl
-from processes import FailedElsewhere
+from processes import FailedElsewhere, end_quietly
 
 P = ParamSpec("P")
 
@@ -59,8 +59,8 @@ def refusals() -> Iterator[None]:
     """Turns :func:`expected` errors into ``SystemExit("error: ...")``."""
     try:
         yield
-    except FailedElsewhere as error:
-        raise SystemExit(1) from error
+    except FailedElsewhere:
+        end_quietly()
     except Exception as error:
         if not expected(error):
             raise

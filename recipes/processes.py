@@ -10,10 +10,11 @@ from __future__ import annotations
 import atexit
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from datetime import timedelta
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -25,6 +26,7 @@ from worldenv_trl.row_share import row_share
 Value = TypeVar("Value")
 Rows = TypeVar("Rows", bound=TensorDictBase)
 
+_PATIENCE = 5.0  # seconds in which the main process says what is wrong
 TIMEOUT = timedelta(days=2)
 """Longer than any stage of the main process. torchrun ends the others as soon as one has failed."""
 NEEDED = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
@@ -55,7 +57,7 @@ def join(device: str) -> str:
     problem = _problem(device)
     if problem is not None:
         if os.environ.get("RANK", "0") != "0":  # one of them says it
-            raise SystemExit(1)
+            end_quietly()
         raise ValueError(problem)
     local = int(os.environ["LOCAL_RANK"])
     on_gpu = device != "cpu" and torch.cuda.is_available()
@@ -85,6 +87,12 @@ def _problem(device: str) -> str | None:
     if device != "cpu" and 0 < gpus < here:
         return f"{here} processes were started on a machine of {gpus} GPUs: --nproc-per-node {gpus}, or --device cpu"
     return None
+
+
+def end_quietly() -> NoReturn:
+    """Ends a process whose error the main one tells, a little later: torchrun ends all when the first has failed."""
+    time.sleep(_PATIENCE)
+    raise SystemExit(1)
 
 
 def leave() -> None:

@@ -164,12 +164,12 @@ def _run(stage: Stage, work: Work, run: Run) -> None:
     except BaseException as error:
         if not interrupted.is_set():
             if isinstance(error, processes.FailedElsewhere):
-                raise SystemExit(1) from error
+                processes.end_quietly()
             if not isinstance(error, Exception) or not expected(error):
                 raise
             kept = run.folder.keep_traceback(error)
             if not processes.speaks_first():
-                raise SystemExit(1) from error
+                processes.end_quietly()
             where = "" if kept is None else f" (stage {stage.name}; where it was raised: {kept})"
             raise SystemExit(f"error: {in_options(error)}{where}") from error
         # Libraries may have turned the KeyboardInterrupt into an error of their own.

@@ -99,7 +99,7 @@ def test_a_flipped_byte_in_the_weights_is_noticed(saved):
 
 def test_a_checkpoint_of_another_class_names_both(saved):
     _, folder = saved
-    with pytest.raises(ValueError, match=r"holds a Tiny, not a Other"):
+    with pytest.raises(ValueError, match=r"holds Tiny, not Other"):
         Other.from_pretrained(folder)
 
 

@@ -154,6 +154,8 @@ class Pretrained(_Module):
         remote = hub.is_repo_id(name)
         files = [CONFIG_NAME, WEIGHTS_NAME, *cls.companion_names]
         folder = hub.download(str(name), files, revision=revision) if remote else Path(name)
+        if (folder / CONFIG_NAME).is_file():  # of another class, which may lack companions
+            _read_config(folder / CONFIG_NAME, cls.__name__)
         for path in (folder, *(folder / file for file in files)):
             if not path.exists():
                 writes = "repository that push_to_hub" if remote else f"folder that {cls.__name__}.save_pretrained"
@@ -190,9 +192,7 @@ def _read_config(path: Path, class_name: str) -> tuple[dict, str | None]:
             f"{path} is not a complete checkpoint config ({error!r}): restore it or train again"
         ) from error
     if saved_class != class_name:
-        raise OtherClassError(
-            f"{path.parent} holds a {saved_class}, not a {class_name}: use {saved_class}.from_pretrained"
-        )
+        raise OtherClassError(f"{path.parent} holds {saved_class}, not {class_name}: use {saved_class}.from_pretrained")
     return fields, config.get("weights_sha256")
 
 

@@ -133,8 +133,8 @@ def _count(row: Row) -> Costs:
     print(
         f"  training step, batch {work.batch}: {counted.trainable / 1e6:,.1f} M trainable, {work.flops / 1e12:.2f} "
         f"TFLOP; weights {_gb(counted.training_weight_bytes)}, optimiser {_gb(counted.optimizer_bytes)}, gradients and "
-        f"activations {_gb(work.peak_bytes)}: {_gb(counted.training_bytes)}, too much for "
-        f"{', '.join(each.name for each in GPUS if each.memory < counted.training_bytes) or 'none'}; "
+        f"activations {_gb(work.peak_bytes)}: {_gb(counted.training_bytes)}, fits "
+        f"{', '.join(each.name for each in GPUS if each.memory >= counted.training_bytes) or 'none'}; "
         f"bound {_bounds(work, 1)} s",
         flush=True,
     )

@@ -101,7 +101,7 @@ REPLAY = [
     (("real.mcap", "--threshold", "3"), "--threshold must be in (0, 1), got 3"),
     (("bare.mcap",), "bare.mcap holds no rollouts"),
     (("real.mcap", "--policy", "gone"), "gone"),
-    (("real.mcap", "--world-model", "policy", "--mode", "imagination"), "holds a OFTPolicy, not a VideoWorldModel"),
+    (("real.mcap", "--world-model", "policy", "--mode", "imagination"), "holds OFTPolicy, not VideoWorldModel"),
     (("real.mcap", "--seed", "1"), "pass --policy"),
     (("real.mcap", "--target", "real.mcap"), "is the recording itself"),
     (("real.mcap", "--target", "taken.mcap"), "taken.mcap exists: pass --overwrite"),

@@ -140,7 +140,7 @@ def test_what_needs_no_video_learns_from_the_exploration(run, monkeypatch):
         ({"resamples": 0}, "--resamples must be at least 1, got 0"),
         ({"policy": "post_train"}, "post_train does not exist"),
         ({"world_model": "world_model_2"}, "world_model_2 does not exist: run the stage 'train_world_model'"),
-        ({"reflector": "world_model"}, "holds a VideoWorldModel, not a CompactReflector"),
+        ({"reflector": "world_model"}, "holds VideoWorldModel, not CompactReflector"),
     ],
 )
 def test_what_cannot_be_measured_is_refused_before_anything_is_drawn(settings, message, run):

@@ -149,7 +149,7 @@ def test_parts_of_the_users_own_are_said_to_be_passed(finished, tmp_path, capsys
     path = run / "checkpoints" / "world_model" / "config.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"class": "MyWorldModel"}))
     assert "<video" not in report_of(run)
-    assert "holds a MyWorldModel, not a VideoWorldModel" in (said := capsys.readouterr().out)
+    assert "holds MyWorldModel, not VideoWorldModel" in (said := capsys.readouterr().out)
     assert "report.write(report.Report(folder), parts)" in said
 
 

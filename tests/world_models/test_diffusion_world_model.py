@@ -178,3 +178,8 @@ def test_the_defaults_are_evacs():
     assert config.latent_size == (40, 64) and config.frames == 20 and config.instructions == (PULL, PUSH)
     assert UNET["cross_attention_dim"] != config.unet["cross_attention_dim"] == 1024
     assert VAE["scaling_factor"] != config.vae["scaling_factor"] == 0.18215
+
+
+def test_cameras_by_name_alone_are_refused_with_what_they_must_be():
+    with pytest.raises(ValueError, match=r"cameras must be \{name: \{instruction: camera\}\}.*got \('agentview',\)"):
+        DiffusionWorldModelConfig.for_cameras(("agentview",))

@@ -7,6 +7,7 @@ import os
 import signal
 import tempfile
 import threading
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -95,6 +96,11 @@ class ProcessWorkers:
                 for future in as_completed(futures):
                     results[futures[future]] = cloudpickle.loads(future.result())
             except BrokenProcessPool as error:
+                lost = len(waiting.keys() - results.keys())
+                warnings.warn(
+                    f"a worker process died (killed, or out of memory); parts of the work that are done again: {lost}",
+                    stacklevel=2,
+                )
                 self._end()
                 attempts = 1 if results.keys() & waiting.keys() else attempts + 1
                 if attempts == ATTEMPTS:

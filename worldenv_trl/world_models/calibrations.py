@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -11,7 +12,21 @@ from torch import Tensor
 
 from worldenv_trl.robot.camera import Camera
 
-__all__ = ["Calibrations"]
+__all__ = ["Calibrations", "plain_cameras"]
+
+
+def plain_cameras(cameras: Mapping[str, Mapping[str, Camera]]) -> dict[str, dict[str, dict[str, Any]]]:
+    """``{camera name: {instruction: camera}}`` as a config holds it.
+
+    Raises:
+        ValueError: for anything else, such as names alone.
+    """
+    if not isinstance(cameras, Mapping) or not all(isinstance(each, Mapping) for each in cameras.values()):
+        raise ValueError(
+            f"cameras must be {{name: {{instruction: camera}}}}, for instance {{'agentview': {{task.language: "
+            f"task.camera('agentview') for task in env.tasks}}}}, got {cameras!r}"
+        )
+    return {name: {text: asdict(camera) for text, camera in each.items()} for name, each in cameras.items()}
 
 
 class Calibrations:

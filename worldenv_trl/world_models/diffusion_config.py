@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from worldenv_trl.robot.camera import Camera
+from worldenv_trl.world_models.calibrations import plain_cameras
 
 __all__ = ["CONDITION_CHANNELS", "DiffusionWorldModelConfig"]
 
@@ -158,11 +159,7 @@ class DiffusionWorldModelConfig:
     @classmethod
     def for_cameras(cls, cameras: Mapping[str, Mapping[str, Camera]], **settings: Any) -> DiffusionWorldModelConfig:
         """Config for ``{camera name: {instruction: camera}}``: what each instruction's scene is seen through."""
-        plain = {
-            name: {text: asdict(camera) for text, camera in by_instruction.items()}
-            for name, by_instruction in cameras.items()
-        }
-        return cls(cameras=plain, **settings)
+        return cls(cameras=plain_cameras(cameras), **settings)
 
     @staticmethod
     def sizes_of(folder: str | Path) -> dict[str, Any]:

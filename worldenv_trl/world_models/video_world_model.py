@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import torch
@@ -24,7 +24,7 @@ from worldenv_trl.world_models.base import (
     memory_key,
     reference_key,
 )
-from worldenv_trl.world_models.calibrations import Calibrations
+from worldenv_trl.world_models.calibrations import Calibrations, plain_cameras
 from worldenv_trl.world_models.cells import from_cells, to_cells, to_float, to_uint8
 from worldenv_trl.world_models.denoiser import Denoiser, View
 from worldenv_trl.world_models.flow_matching import sample, seeded_noise
@@ -111,11 +111,7 @@ class VideoWorldModelConfig:
     @classmethod
     def for_cameras(cls, cameras: Mapping[str, Mapping[str, Camera]], **settings: Any) -> VideoWorldModelConfig:
         """Config for ``{camera name: {instruction: camera}}``: what each instruction's scene is seen through."""
-        plain = {
-            name: {text: asdict(camera) for text, camera in by_instruction.items()}
-            for name, by_instruction in cameras.items()
-        }
-        return cls(cameras=plain, **settings)
+        return cls(cameras=plain_cameras(cameras), **settings)
 
     def rows_at_once(self, device: torch.device | str = "cpu") -> int:
         """:attr:`rows_per_call`, or what it is on ``device`` when that is None."""
