@@ -159,9 +159,7 @@ def _measure(row: Row, counted: Costs, device: torch.device, gpu: GPU | None, mo
         _guarded(row, partial(_measure_training, row, module, counted, device, gpu, mode))
 
 
-def _measure_call(
-    row: Row, module: nn.Module, work: Work, device: torch.device, gpu: GPU | None, mode: str
-) -> None:
+def _measure_call(row: Row, module: nn.Module, work: Work, device: torch.device, gpu: GPU | None, mode: str) -> None:
     units = work.batch * row.units_per_row
     seconds = measured_call(row, module, work.batch)
     share = _share(seconds, work, gpu)
@@ -182,7 +180,9 @@ def _measure_training(
 
 def _share(seconds: float, work: Work, gpu: GPU | None) -> str:
     rate = f", {work.flops / seconds / 1e12:.1f} TFLOP/s"
-    return rate if gpu is None else f"{rate}, {gpu.bound(work.flops, work.read_bytes) / seconds:.0%} of {gpu.name}'s bound"
+    return (
+        rate if gpu is None else f"{rate}, {gpu.bound(work.flops, work.read_bytes) / seconds:.0%} of {gpu.name}'s bound"
+    )
 
 
 def _peak(device: torch.device) -> str:
