@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import json
+import re
 import shutil
 import socket
 import struct
@@ -12,9 +13,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from policy_servers import serving, talking
 
 from worldenv_trl.policies import bridge
@@ -224,3 +227,61 @@ def test_the_folder_is_python_3_10():
     assert len(files) == 4
     for file in files:
         ast.parse(file.read_text(), feature_version=(3, 10))
+
+
+@pytest.mark.parametrize("package", ["openpi", "lerobot"])
+def test_the_adapters_of_the_readme_hand_over_what_the_packages_take_and_the_bridge_wants(package, monkeypatch):
+    """With stand-ins for the packages, which are not installed: shapes and types alone, and which way round."""
+    blocks = re.findall(r"```python\n(.*?)```", (FOLDER.parent / "README.md").read_text(), re.S)
+    (code,) = [block for block in blocks if f"from {package}." in block]
+    seen, handed = [], []
+
+    class Policy:
+        config = None
+
+        def infer(self, observation):
+            seen.append(observation)
+            return {"actions": np.zeros((10, 32))}
+
+        def predict_action_chunk(self, observation):
+            seen.append(observation)
+            return torch.zeros(3, 50, 7)
+
+        from_pretrained = classmethod(lambda cls, path: cls())
+        to = eval = lambda self, *_: self
+
+    fakes = {
+        "bridge": {"Description": Description, "serve": lambda *given: handed.extend(given)},
+        "openpi.policies": {"policy_config": SimpleNamespace(create_trained_policy=lambda *_: Policy())},
+        "openpi.training": {"config": SimpleNamespace(get_config=str)},
+        "lerobot.policies.factory": {
+            "get_policy_class": lambda name: Policy,
+            "make_pre_post_processors": lambda *_, **__: (dict, lambda action: action),
+        },
+    }
+    for name, contents in fakes.items():
+        module = ModuleType(name)
+        vars(module).update(contents)
+        monkeypatch.setitem(sys.modules, name, module)
+    exec(code, {})
+    act, told, _ = handed
+    size = told.image_size
+    rng = np.random.default_rng(0)
+    images = {camera: rng.integers(0, 256, (3, 3, size, size), np.uint8) for camera in told.cameras}
+    state = rng.uniform(0, 1, (3, 7)).astype(np.float32)
+    with serving(PolicyServer(act, told)) as address:
+        arrays = {f"image.{camera}": image for camera, image in images.items()} | {"state": state}
+        answer, found = ask(address, {"kind": "act", "id": 1, "instructions": ["a", "b", "c"]}, arrays)
+    assert answer["kind"] == "actions" and found["actions"].shape == (3, told.chunk_length, 7)
+    first = {name: np.asarray(value) for name, value in seen[0].items()}
+    if package == "openpi":
+        assert len(seen) == 3 and seen[2]["prompt"] == "c"
+        np.testing.assert_array_equal(first["observation/image"], images["agentview"][0].transpose(1, 2, 0)[:, ::-1])
+        found_state = first["observation/state"]
+    else:
+        assert seen[0]["task"] == ["a", "b", "c"]
+        np.testing.assert_allclose(first["observation.images.image2"], images["wrist"][..., ::-1] / 255, atol=1e-6)
+        found_state = first["observation.state"][0]
+    expected = [*state[0, :6], 0.04 * state[0, 6], -0.04 * state[0, 6]]
+    assert found_state.dtype == np.float32
+    np.testing.assert_allclose(found_state, expected, atol=1e-6)
