@@ -17,7 +17,7 @@ ACTION_DIM = 7
 class ActionUnits:
     """What a policy's actions mean. The defaults are LIBERO's and this package's: those are not converted.
 
-    An action is dx dy dz and a rotation vector, in the axes of the robot's base, and the gripper.
+    An action is dx dy dz and a rotation vector, in the axes of the robot's base (x forward, z up), and the gripper.
 
     Args:
         position: metres of an action of +1.

@@ -22,7 +22,7 @@ PROTOCOL_VERSION = 1
 
 _MAGIC = b"WEPB"
 _PREFIX = struct.Struct("!4sHIQ")  # magic, version, bytes of the header, bytes of the arrays
-_MAX_HEADER, _MAX_ARRAYS = 1 << 20, 1 << 32  # what asks for more is no message of ours
+_MAX_HEADER, _MAX_ARRAYS = 1 << 20, 1 << 30  # what asks for more is no message of ours
 
 
 class ProtocolError(ValueError):
@@ -57,7 +57,9 @@ def send_message(
     text = json.dumps(header).encode()
     data = safetensors.numpy.save({name: np.ascontiguousarray(value) for name, value in (arrays or {}).items()})
     connection.settimeout(_remaining(deadline))
-    connection.sendall(_PREFIX.pack(_MAGIC, PROTOCOL_VERSION, len(text), len(data)) + text + data)
+    connection.sendall(_PREFIX.pack(_MAGIC, PROTOCOL_VERSION, len(text), len(data)) + text)
+    connection.settimeout(_remaining(deadline))
+    connection.sendall(data)
 
 
 def receive_message(
@@ -115,15 +117,16 @@ def socket_address(address: str) -> tuple[int, Any]:
 
 
 def _receive(connection: socket.socket, count: int, deadline: float | None, at_start: bool = False) -> bytearray:
-    data = bytearray()
-    while len(data) < count:
+    data = bytearray(count)
+    view, filled = memoryview(data), 0
+    while filled < count:
         connection.settimeout(_remaining(deadline))
-        part = connection.recv(min(count - len(data), 1 << 20))
-        if not part:
-            if at_start and not data:
+        received = connection.recv_into(view[filled:])
+        if not received:
+            if at_start and not filled:
                 raise EOFError("the other side has closed the connection")
             raise ConnectionError("the other side has closed the connection inside a message")
-        data += part
+        filled += received
     return data
 
 
