@@ -110,22 +110,35 @@ def test_parallel_clients_get_their_own_answers(server, local):
     assert not wrong and not any(thread.is_alive() for thread in threads)
 
 
-def _ask_in_a_child(policy, td, expected, answers):
-    answers.put(all(torch.equal(policy(td.copy())[keys.LOC], expected) for _ in range(5)))
+def _ask_in_a_child(policy, answers):
+    answers.put(policy(observed())[keys.LOC].shape)
 
 
-def test_a_forked_process_and_a_pickled_copy_connect_for_themselves(server, local):
-    external, td = ExternalPolicy.connect(server.address), observed(CAMERAS)
-    with torch.no_grad():
-        expected, other = local(td.copy())[keys.LOC], local(td[:1].copy())[keys.LOC]
-    assert torch.equal(pickle.loads(pickle.dumps(external))(td.copy())[keys.LOC], expected)
+def test_a_copy_and_a_forked_process_have_connections_of_their_own():
+    """Two askers on one connection would mix their answers."""
+    said: list[str] = []
     fork = multiprocessing.get_context("fork")
     answers = fork.Queue()
-    child = fork.Process(target=_ask_in_a_child, args=(external, td, expected, answers))
-    child.start()
-    mine = [torch.equal(external(td[:1].copy())[keys.LOC], other) for _ in range(5)]
-    assert answers.get(timeout=60) and all(mine)
-    child.join(20)
+    with serving(PolicyServer(still, TOLD, say=said.append)) as address:
+        external = ExternalPolicy.connect(address)
+        clients = []
+        for ask in (
+            lambda: external(observed()),
+            lambda: external(observed()),
+            lambda: pickle.loads(pickle.dumps(external))(observed()),
+            lambda: copy.deepcopy(external)(observed()),
+        ):
+            ask()
+            clients.append(sum(line.endswith("is here") for line in said))
+        child = fork.Process(target=_ask_in_a_child, args=(external, answers))
+        child.start()
+        assert answers.get(timeout=60) == (6, 8, 7)
+        child.join(20)
+        clients.append(sum(line.endswith("is here") for line in said))
+        external(observed())
+        clients.append(sum(line.endswith("is here") for line in said))
+    first = clients[0]
+    assert clients == [first, first, first + 1, first + 2, first + 3, first + 3]
 
 
 def test_what_it_saves_names_the_server_and_holds_it_against_what_was_said(server, tmp_path):

@@ -116,7 +116,10 @@ class ExternalPolicy(Policy, Pretrained):
             RuntimeError: if it is no policy server, or one of another version.
             ValueError: for what is no address.
         """
-        return cls(ExternalConfig(address, ExternalConnection(address, timeout).describe(), timeout))
+        connection = ExternalConnection(address, timeout)
+        description = connection.describe()
+        connection.close()
+        return cls(ExternalConfig(address, description, timeout))
 
     @classmethod
     def from_pretrained(
