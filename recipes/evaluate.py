@@ -33,18 +33,18 @@ def evaluate(run: Run, before: str, after: str, models: str | None) -> None:
     found: list[dict[str, list[bool]]] = []  # of each pair, by task
     for index in Resumable(run, "policies", len(pairs), minutes=0, found=found):  # a recording is whole or begins anew
         protocol, name = pairs[index]
-        success = _rolled(run, protocol, name, reflector if protocol == "reflector" else None)
+        success = rolled(run, protocol, name, reflector if protocol == "reflector" else None)
         found.append({task: each.tolist() for task, each in success.items()})
         if name == after:
             earlier, later = ({task: torch.tensor(each) for task, each in one.items()} for one in found[-2:])
-            _log_protocol(folder, protocol, {before: earlier, after: later})
+            log_protocol(folder, "evaluate", protocol, {before: earlier, after: later})
 
 
-def _rolled(run: Run, protocol: str, name: str, judge: Judge | None) -> dict[str, torch.Tensor]:
+def rolled(run: Run, protocol: str, name: str, judge: Judge | None) -> dict[str, torch.Tensor]:
     """Success bool ``[episodes]`` of a policy in every task; writes its recording."""
     config, policy = run.config, run.policy(name)
     actor = laplace_actor(policy)
-    described = outcomes_env(config, config.tasks[0], "test", judge, 1, with_sim_state=True)
+    described = outcomes_env(config, config.tasks[0], "test", judge, 1, with_sim_state=True, proprio=policy.proprio)
     taking_part = {"policy": policy} | ({} if judge is None else {"reflector": judge.reflector})
     about = recording(config, described, "evaluate", taking_part, policy=name, protocol=protocol)
     described.close()
@@ -59,27 +59,30 @@ def _rolled(run: Run, protocol: str, name: str, judge: Judge | None) -> dict[str
                 judge=judge,
                 writer=writer,
                 label=f"{name}, {protocol} stops",
+                proprio=policy.proprio,
             )
             for task in config.tasks
         }
 
 
-def _log_protocol(folder: RunFolder, protocol: str, outcomes: dict[str, dict[str, torch.Tensor]]) -> None:
-    """Of two policies, by task, and how they differ."""
+def log_protocol(folder: RunFolder, stage: str, protocol: str, outcomes: dict[str, dict[str, torch.Tensor]]) -> None:
+    """Of one policy, by task, or of two and how they differ."""
     whole = {name: {"all": torch.cat(list(per_task.values()))} | per_task for name, per_task in outcomes.items()}
     for name, per_task in whole.items():
         for task, success in per_task.items():
-            _log(folder, protocol, name, task, success)
+            _log(folder, stage, protocol, name, task, success)
+    if len(whole) == 1:
+        return
     earlier, later = whole.values()
     for task, success in earlier.items():
         test = paired_test(success, later[task])
-        folder.log("evaluate", protocol=protocol, task=task, paired=True, **{k: float(v) for k, v in test.items()})
+        folder.log(stage, protocol=protocol, task=task, paired=True, **{k: float(v) for k, v in test.items()})
 
 
-def _log(folder: RunFolder, protocol: str, policy: str, task: str, success: torch.Tensor) -> None:
+def _log(folder: RunFolder, stage: str, protocol: str, policy: str, task: str, success: torch.Tensor) -> None:
     low, high = wilson_interval(int(success.sum()), len(success))
     folder.log(
-        "evaluate",
+        stage,
         protocol=protocol,
         policy=policy,
         task=task,

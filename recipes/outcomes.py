@@ -17,6 +17,7 @@ from tqdm import tqdm
 from collecting import of_worker
 from config import WorldEnvConfig
 from imagination import Imagination
+from parts import PROPRIO
 from physics import tabletop
 from run import Run
 from worldenv_trl import keys
@@ -47,16 +48,18 @@ def physics_outcomes(
     writer: RolloutWriter | None = None,
     label: str = "",
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
+    proprio: str = PROPRIO,
 ) -> torch.Tensor:
     """Success bool ``[episodes]`` of the first initial states of a split, or of those at ``indices``, in order.
 
     The goal predicate ends an episode, or, with a ``judge``, the reflector alone does: then success is whether the
     goal holds in the moment it stops (or at the step limit). Actions are greedy unless ``exploration_type`` differs.
     """
-    options: dict[str, Any] = {"init_state_count": episodes}
+    options: dict[str, Any] = {"init_state_count": episodes, "proprio": proprio}
     if indices is not None:  # these initial states of the split only
         task_id, episodes = run.config.tasks.index(task), len(indices)
         options = {
+            "proprio": proprio,
             "init_states": load_task(task).init_states(split, max(indices) + 1)[list(indices)],
             "context_ids": [context_id(task_id, split, index) for index in indices],
         }

@@ -29,6 +29,7 @@ def tabletop(
         "seed": stage_seed(config.seed, "tabletop"),
         "num_threads": config.num_threads,
         "cameras": config.cameras,
+        "proprio": PROPRIO,
     } | options
     if split == "train":
         options = {"init_state_count": config.train_states} | options
@@ -38,7 +39,6 @@ def tabletop(
         image_size=config.image_size,
         init_split=split,
         max_steps=config.max_steps,
-        proprio=PROPRIO,
         task_ids=[config.tasks.index(task) for task in tasks],
         **options,
     )

@@ -1,19 +1,23 @@
 """Policies: the interface, the Laplace distribution and actor, the compact OFT policy, policies over
-Hugging Face vision-language models, image augmentation."""
+Hugging Face vision-language models and behind servers, image augmentation."""
 
 from worldenv_trl.policies.actor import LaplaceActor, laplace_actor, likelihood_actor, scale_bounds
 from worldenv_trl.policies.augmentation import random_shift
 from worldenv_trl.policies.base import Policy
 from worldenv_trl.policies.device_bridge import DeviceBridge
+from worldenv_trl.policies.external import ExternalConfig, ExternalPolicy
 from worldenv_trl.policies.hf import HFConfig, HFPolicy
 from worldenv_trl.policies.laplace import IndependentLaplace
 from worldenv_trl.policies.oft import OFTConfig, OFTPolicy
 from worldenv_trl.policies.openvla_oft import load_openvla_oft
 from worldenv_trl.policies.pairing import check_pairing
+from worldenv_trl.policies.serving import ServedPolicy
 from worldenv_trl.policies.token_actor import IndependentCategorical, TokenActor, token_actor
 
 __all__ = [
     "DeviceBridge",
+    "ExternalConfig",
+    "ExternalPolicy",
     "HFConfig",
     "HFPolicy",
     "IndependentCategorical",
@@ -22,6 +26,7 @@ __all__ = [
     "OFTConfig",
     "OFTPolicy",
     "Policy",
+    "ServedPolicy",
     "TokenActor",
     "check_pairing",
     "laplace_actor",

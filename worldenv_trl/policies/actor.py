@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -46,6 +47,15 @@ class LaplaceActor(ProbabilisticActor):
     @property
     def policy(self) -> Policy:
         return self.module[0][0]
+
+    def get_dist(self, *args: Any, **kwargs: Any) -> IndependentLaplace:
+        """The density that losses score; acting does without it.
+
+        Raises:
+            RuntimeError: for a policy that cannot learn.
+        """
+        self.policy.require_gradients()
+        return super().get_dist(*args, **kwargs)
 
     @property
     def scale_factor(self) -> float:

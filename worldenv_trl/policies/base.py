@@ -109,6 +109,9 @@ class Policy(TensorDictModuleBase, abc.ABC):
             ValueError: if there are adapters of another rank.
         """
 
+    def require_gradients(self) -> None:
+        """Called by what is about to score or to train it: raises for a policy whose actions have no gradient."""
+
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         state = tensordict[STATE]
