@@ -86,9 +86,8 @@ def _backward(loss: LOOPLoss, batch: TensorDictBase) -> dict[str, float]:
     """Gradients and figures of a minibatch, so many rows at a time as fit: the losses of the parts add up to that of
     the whole."""
     pixels = sum(value[0].numel() for value in batch["observation"].values() if value.dtype == torch.uint8)
-    at_once = _PIXELS if batch[keys.CHUNK].device.type == "cpu" else _PIXELS_ON_GPU
     steps, figures = batch[keys.STEP_MASK].sum(), dict[str, float]()
-    for part in batch.split(max(16, at_once // max(pixels, 1))):
+    for part in batch.split(rows_at_once(pixels, batch[keys.CHUNK].device.type)):
         out = loss(part)
         out["loss_objective"].backward()
         names = [name for name, value in out.items() if value.numel() == 1]
@@ -97,6 +96,11 @@ def _backward(loss: LOOPLoss, batch: TensorDictBase) -> dict[str, float]:
             weight = 1.0 if name == "loss_objective" else share
             figures[name] = figures.get(name, 0.0) + weight * value
     return figures
+
+
+def rows_at_once(pixels: int, device_type: str) -> int:
+    """Decisions whose activations are there together, each of so many numbers of images."""
+    return max(16, (_PIXELS if device_type == "cpu" else _PIXELS_ON_GPU) // max(pixels, 1))
 
 
 def ratios(wave: TensorDictBase, in_keys: Sequence[NestedKey], loss: LOOPLoss) -> TensorDictBase:

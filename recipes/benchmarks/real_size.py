@@ -27,6 +27,7 @@ from real_size_row import Costs, Row, Work, costs, empty, free, measured_call, m
 from torch import nn
 
 from command_line import refusals
+from gpus import GPU, GPUS
 from speeds import matmul_bound
 from worldenv_trl.devices import choose_device
 
@@ -34,32 +35,6 @@ Result = TypeVar("Result")
 
 FAMILIES = {"policy": "real_size_policy", "models": "real_size_models"}
 """By the name of the part: the module beside this one whose ``ROWS`` are its rows."""
-
-
-@dataclass(frozen=True)
-class GPU:
-    """Peak rates of a GPU, dense and without sparsity."""
-
-    name: str
-    bf16_flops: float
-    """FLOP/s of bfloat16 matrix products that add up in float32."""
-    bandwidth: float
-    """Bytes per second of its memory."""
-    memory: float
-    """Bytes."""
-    source: str
-
-    def bound(self, flops: int, weight_bytes: int) -> float:
-        """Seconds that no program goes below."""
-        return max(flops / self.bf16_flops, weight_bytes / self.bandwidth)
-
-
-GPUS = (
-    GPU("H200", 989e12, 4.8e12, 141e9, "NVIDIA H200 Tensor Core GPU datasheet, SXM (1,979 TFLOPS with sparsity)"),
-    GPU("H100", 989e12, 3.35e12, 80e9, "NVIDIA H100 Tensor Core GPU datasheet, SXM (1,979 TFLOPS with sparsity)"),
-    GPU("A100", 312e12, 2.039e12, 80e9, "NVIDIA A100 80GB Tensor Core GPU datasheet, SXM"),
-    GPU("RTX 4090", 165.2e12, 1.008e12, 24e9, "NVIDIA Ada GPU Architecture whitepaper, appendix A, FP32 accumulate"),
-)
 
 
 @dataclass(frozen=True)
@@ -159,9 +134,7 @@ def _measure(row: Row, counted: Costs, device: torch.device, gpu: GPU | None, mo
         _guarded(row, partial(_measure_training, row, module, counted, device, gpu, mode))
 
 
-def _measure_call(
-    row: Row, module: nn.Module, work: Work, device: torch.device, gpu: GPU | None, mode: str
-) -> None:
+def _measure_call(row: Row, module: nn.Module, work: Work, device: torch.device, gpu: GPU | None, mode: str) -> None:
     units = work.batch * row.units_per_row
     seconds = measured_call(row, module, work.batch)
     share = _share(seconds, work, gpu)
@@ -182,7 +155,9 @@ def _measure_training(
 
 def _share(seconds: float, work: Work, gpu: GPU | None) -> str:
     rate = f", {work.flops / seconds / 1e12:.1f} TFLOP/s"
-    return rate if gpu is None else f"{rate}, {gpu.bound(work.flops, work.read_bytes) / seconds:.0%} of {gpu.name}'s bound"
+    return (
+        rate if gpu is None else f"{rate}, {gpu.bound(work.flops, work.read_bytes) / seconds:.0%} of {gpu.name}'s bound"
+    )
 
 
 def _peak(device: torch.device) -> str:
