@@ -174,6 +174,8 @@ class RealSize:
     """A folder of diffusers with ``vae``, ``unet`` and ``image_encoder``, those there are."""
     frame_size: tuple[int, int] = (320, 512)
     """Height and width (px) of the frames inside the world model."""
+    rows_per_call: int = 2
+    """Videos whose next chunk the world model paints at once; more are quicker and take more memory."""
     num_frames: int = 32
     """Frames of a video that the reflector looks at."""
     score_every: int = 8

@@ -29,8 +29,8 @@ _SMALLER = {
     "sft": "--sft.batch-size, --post-train.lora-rank",
     "explore": "--explore.num-envs",
     "train_world_model": "--world-model.batch-size, --real-size.frame-size",
-    "train_reflector": "--real-size.num-frames, --real-size.score-every",
-    "post_train": "--post-train.minibatch-size, --post-train.groups, --post-train.lora-rank, --max-steps",
+    "train_reflector": "--real-size.rows-per-call, --real-size.num-frames",
+    "post_train": "--post-train.minibatch-size, --post-train.groups, --post-train.lora-rank, --real-size.rows-per-call",
     "evaluate": "--evaluate.num-envs",
 }
 

@@ -96,6 +96,7 @@ def world_model_config(config: WorldEnvConfig, **sizes: Any) -> DiffusionWorldMo
         image_size=config.image_size,
         chunk_length=config.chunk_length,
         frame_size=config.real_size.frame_size,
+        rows_per_call=config.real_size.rows_per_call,
         num_denoise_steps=config.world_model.denoise_steps,
         gradient_checkpointing=True,
         **sizes,

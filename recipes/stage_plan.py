@@ -161,16 +161,23 @@ def _memory(kind: str, config: WorldEnvConfig, found: Rehearsal, machine: Machin
     def rows(whole: int) -> int:
         return -(-whole // machine.gpus)
 
-    def imagined(videos: int) -> float:
-        at_once = min(videos, found.rows_imagined)
+    def kept(videos: int) -> float:
+        return videos * found.kept_bytes * (1 if "learn" in calls else config.max_steps + 1)
+
+    def judging(videos: int) -> float:
         passes = videos if "learn" in calls else min(_PROMPTS_AT_ONCE, videos * found.judgements)
         seen = min(_FRAMES_SEEN, videos * config.chunk_length) * calls["see"].activation_bytes
-        kept = videos * found.kept_bytes * (1 if "learn" in calls else config.max_steps + 1)
-        judged = kept + max(seen, passes * calls["judge"].activation_bytes)
-        return max(at_once * calls["imagine"].activation_bytes, judged)
+        return max(seen, passes * calls["judge"].activation_bytes)
 
-    policy, judged = Held(sizes["policy"]), config.post_train.env == "imagined"
-    dreaming = [Held(sizes["world_model"]), Held(sizes["reflector"])] if judged else []
+    def judged(videos: int) -> float:
+        return kept(videos) + judging(videos)
+
+    def imagined(videos: int) -> float:
+        painting = min(videos, found.rows_imagined) * calls["imagine"].activation_bytes
+        return kept(videos) + max(painting, judging(videos))
+
+    policy, dreamed = Held(sizes["policy"]), config.post_train.env == "imagined"
+    dreaming = [Held(sizes["world_model"]), Held(sizes["reflector"])] if dreamed else []
     if kind == "sft":
         return [Held(sizes["sft"], learns=True)], rows(config.sft.batch_size) * calls["sft"].activation_bytes
     if kind == "explore":
@@ -187,14 +194,12 @@ def _memory(kind: str, config: WorldEnvConfig, found: Rehearsal, machine: Machin
         videos = rows(settings.groups * settings.group_size)
         pixels = len(config.sft.cameras or config.cameras) * 3 * config.image_size**2
         part = min(rows(settings.minibatch_size), rows_at_once(pixels, machine.kind))
-        lived = max(videos * calls["decide"].activation_bytes, imagined(videos) if judged else 0.0)
+        lived = max(videos * calls["decide"].activation_bytes, imagined(videos) if dreamed else 0.0)
         held = [Held(sizes["policy"], learns=True, copies=2), *dreaming]
         return held, max(lived, part * calls["update"].activation_bytes)
     if kind == "evaluate":
         batch = rows(config.evaluate.num_envs)
-        return [policy, *dreaming[1:]], max(
-            batch * calls["decide"].activation_bytes, imagined(batch) if judged else 0.0
-        )
+        return [policy, *dreaming[1:]], max(batch * calls["decide"].activation_bytes, judged(batch) if dreamed else 0.0)
     return [], 0.0
 
 

@@ -96,10 +96,11 @@ def test_memory_of_the_stages():
     assert plans["sft"].activation_bytes == 2 * 4.0
     assert plans["sft"].whole_bytes == 400 + 40 + 80 + 2 * 4.0
     assert plans["sft"].sharded_bytes == (400 + 40 + 80) / 4 + 40 + 2 * 4.0
-    # Two videos: their frames' tokens and four judgements, more than two chunks painted or two updates.
-    held = 2 * 17 * 0.125 + max(2 * 8 * 0.25, 4 * 1.0)
-    assert plans["post_train"].activation_bytes == max(2 * 2.0, 2 * 5.0, held, 2 * 4.0)
-    assert plans["post_train"].whole_bytes == (2 * 400 + 40 + 80) + 200 + 100 + 10.0
+    # Two videos: the tokens of their frames, and two chunks painted, more than four judgements or two updates.
+    held = 2 * 17 * 0.125 + max(2 * 5.0, 2 * 8 * 0.25, 4 * 1.0)
+    assert plans["post_train"].activation_bytes == max(2 * 2.0, held, 2 * 4.0)
+    assert plans["evaluate"].whole_bytes == 400 + 100 + max(1 * 2.0, 17 * 0.125 + max(8 * 0.25, 2 * 1.0))
+    assert plans["post_train"].whole_bytes == (2 * 400 + 40 + 80) + 200 + 100 + held
     assert [name for name, stage in plans.items() if stage.physics] == [
         "demonstrate", "explore", "post_train", "evaluate",
     ]  # fmt: skip
