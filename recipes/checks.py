@@ -34,8 +34,8 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     """Fails before any long work starts if a task is unknown, a setting impossible, a device missing or no
     GL backend renders.
 
-    What only the compact parts refuse is found by making those of them that ``parts`` holds; others, which may take
-    long to make, are not made.
+    What only the compact parts refuse is found by making those of them that ``parts`` holds, what others do by their
+    outlines, where there are any: they may take long to make.
 
     Raises:
         ValueError: naming the setting.
@@ -141,8 +141,9 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     tabletop(config, "train", len(config.tasks), None).close()
     for name in ("policy", "world_model", "reflector"):
         part = getattr(parts, name)
-        if part is getattr(COMPACT, name):
+        make = part.make if part is getattr(COMPACT, name) else part.outline
+        if make is not None:
             try:
-                part.make(config)
+                make(config)
             except ValueError as error:
                 raise ValueError(f"the {name.replace('_', ' ')} cannot be made of these settings: {error}") from error

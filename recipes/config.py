@@ -1,4 +1,4 @@
-"""Settings of every stage, and the two presets. ``python recipes/world_env.py smoke --help`` lists them all."""
+"""Settings of every stage, and the presets. ``python recipes/world_env.py smoke --help`` lists them all."""
 
 from __future__ import annotations
 
@@ -9,6 +9,22 @@ GOAL_TASKS = (
     "starter/put_the_bowl_on_the_plate",
     "starter/open_the_top_drawer",
     "starter/turn_on_the_stove",
+)
+
+GOAL_SUITE = tuple(
+    f"goal/{name}"
+    for name in (
+        "open_the_middle_drawer",
+        "open_the_top_drawer",
+        "open_the_top_drawer_and_put_the_bowl_inside",
+        "push_the_plate_to_the_front_of_the_stove",
+        "put_the_bowl_on_the_plate",
+        "put_the_bowl_on_the_stove",
+        "put_the_bowl_on_top_of_the_cabinet",
+        "put_the_cream_cheese_in_the_bowl",
+        "put_the_wine_bottle_on_the_rack",
+        "turn_on_the_stove",
+    )
 )
 
 
@@ -145,6 +161,30 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class RealSize:
+    """Local folders of pretrained parts, and what they are made with. Read with ``parts`` at ``real-size`` alone."""
+
+    policy: Path | None = None
+    """A vision-language model as transformers' ``save_pretrained`` wrote it, or a checkpoint of OpenVLA-OFT."""
+    statistics: str = ""
+    """Key of the checkpoint's ``dataset_statistics.json``; the only one when empty."""
+    reflector: Path | None = None
+    """A LLaVA-OneVision or LLaVA-Video model as ``save_pretrained`` wrote it."""
+    world_model: Path | None = None
+    """A folder of diffusers with ``vae``, ``unet`` and ``image_encoder``, those there are."""
+    frame_size: tuple[int, int] = (320, 512)
+    """Height and width (px) of the frames inside the world model."""
+    rows_per_call: int = 2
+    """Videos whose next chunk the world model paints at once; more are quicker and take more memory."""
+    num_frames: int = 32
+    """Frames of a video that the reflector looks at."""
+    score_every: int = 8
+    """Frames between two judgements of the reflector, a pass of its language model each."""
+    dtype: str = "bfloat16"
+    """Of the frozen weights of policy and reflector: ``bfloat16`` or ``float32``."""
+
+
+@dataclass(frozen=True)
 class WorldEnvConfig:
     """The whole loop: demonstrations -> SFT -> exploration -> world model -> reflector -> LOOP -> evaluation."""
 
@@ -167,6 +207,8 @@ class WorldEnvConfig:
     """Between two checkpoints of the running stage: at most so much is lost when it is killed."""
     logger: tuple[str, ...] = ()
     """Where figures, plots and videos go beside ``metrics.jsonl``: any of csv, tensorboard, wandb, mlflow, mcap."""
+    parts: str = "compact"
+    """``compact``, made here, or ``real-size``: pretrained ones of the folders in ``real_size``."""
     tasks: tuple[str, ...] = GOAL_TASKS
     """``suite/name`` or a ``.bddl`` file, each once; ``task_id`` is the place in this list."""
     cameras: tuple[str, ...] = ("agentview",)
@@ -199,6 +241,7 @@ class WorldEnvConfig:
     reflector: Reflector = field(default_factory=Reflector)
     post_train: PostTrain = field(default_factory=PostTrain)
     evaluate: Evaluate = field(default_factory=Evaluate)
+    real_size: RealSize = field(default_factory=RealSize)
 
 
 PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
@@ -223,6 +266,21 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
             explore=Explore(episodes_per_task=480),
             reflector=Reflector(choose_threshold=True),
             post_train=PostTrain(iterations=40),
+        ),
+    ),
+    "real-size": (
+        "Pretrained parts of billions of parameters, from local folders (--real-size.*), on GPUs; first --dry-run.",
+        WorldEnvConfig(
+            run_dir=Path("runs/real_size"),
+            device="cuda",
+            parts="real-size",
+            tasks=GOAL_SUITE,
+            cameras=("agentview", "wrist"),
+            image_size=256,
+            max_steps=152,
+            sft=SFT(steps=5000, batch_size=64, lr=5e-4, shift_px=0, scale_steps=1000, scale_lr=5e-4),
+            world_model=WorldModel(steps=10000, batch_size=16, lr=5e-5, denoise_steps=4, deterministic=False),
+            post_train=PostTrain(minibatch_size=32, lora_rank=32, lora_lr=1e-4, head_lr=1e-5),
         ),
     ),
 }

@@ -12,7 +12,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from config import WorldEnvConfig
-from parts import COMPACT, Parts, instructions
+from parts import Parts, instructions
+from real_parts import parts_of
 from run import Run
 from run_folder import RunFolder
 from two_worlds import TwoWorlds, honesty_of, imagine, live, relive
@@ -37,7 +38,7 @@ def gather(
     episodes_per_task: int,
     clips_per_kind: int,
     num_threads: int,
-    parts: Parts = COMPACT,
+    parts: Parts | None = None,
     device: str = "auto",
 ) -> Evidence:
     """Everything that needs the run's models; what cannot be had is named in ``missing``.
@@ -48,7 +49,7 @@ def gather(
             a device that does not exist.
     """
     config = read_config(record, num_threads, device)
-    run = Run(config, RunFolder(record.path), parts)
+    run = Run(config, RunFolder(record.path), parts_of(config) if parts is None else parts)
     models = [path.name for path in sorted((record.path / "checkpoints").glob("reflector*")) if path.is_dir()]
     suffix = models[-1].removeprefix("reflector") if models else ""
     world_model, reflector, rules = run.world_model(suffix), run.reflector(suffix), run.rules(suffix)

@@ -29,6 +29,8 @@ class Part(Generic[Kind]):
 
     make: Callable[[WorldEnvConfig], Kind]
     load: Callable[[Path], Kind]
+    outline: Callable[[WorldEnvConfig], Kind] | None = None
+    """What ``make`` makes, on the meta device and without reading weights, where making it takes long."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import tyro
 
 from command_line import refusals
 from gather_evidence import gather, short
-from parts import COMPACT, Parts
+from parts import Parts
 from threads import use_threads
 from worldenv_trl.devices import choose_device
 from worldenv_trl.pretrained import OtherClassError
@@ -49,8 +49,9 @@ def main(settings: Report) -> Path:
     return out
 
 
-def write(settings: Report, parts: Parts = COMPACT) -> Path:
-    """Writes the report and says where it is, and what is missing in it.
+def write(settings: Report, parts: Parts | None = None) -> Path:
+    """Writes the report and says where it is, and what is missing in it; the parts are those that the run's settings
+    name unless others are given.
 
     Raises:
         OSError: if there is no run folder, or the report cannot be written.

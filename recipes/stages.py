@@ -19,7 +19,8 @@ import processes
 from checks import check_config, check_shares
 from command_line import expected, in_options, refusals
 from config import PRESETS, WorldEnvConfig
-from parts import COMPACT, Parts
+from parts import Parts
+from real_parts import parts_of
 from run import Run
 from run_folder import RunFolder
 from threads import use_threads
@@ -83,7 +84,7 @@ def run_stages(run: Run, works: Mapping[str, Work]) -> None:
             _run(stage, works[stage.kind], run)
 
 
-def run_alone(kind: str, work: Work, arguments: Sequence[str] | None = None, parts: Parts = COMPACT) -> None:
+def run_alone(kind: str, work: Work, arguments: Sequence[str] | None = None, parts: Parts | None = None) -> None:
     """Runs one stage of a preset alone, from the beginning if it is finished, else from where it was interrupted; of
     several rounds, the first unfinished one.
 
@@ -115,14 +116,16 @@ def parse(arguments: Sequence[str], module: str = "__main__") -> WorldEnvConfig:
     return tyro.extras.overridable_config_cli(PRESETS, args=arguments, description=sys.modules[module].__doc__)
 
 
-def open_run(config: WorldEnvConfig, parts: Parts = COMPACT) -> Run:
-    """The run of checked settings; what is wrong with them is said in one line."""
+def open_run(config: WorldEnvConfig, parts: Parts | None = None) -> Run:
+    """The run of checked settings, with the parts that they name unless others are given; what is wrong is said in one
+    line."""
     with refusals():
         processes.join(config.device)
+        chosen = parts_of(config) if parts is None else parts
         folder = RunFolder(config.run_dir)
         count = processes.size()
-        processes.on_main(lambda: _check_and_open(config, parts, folder, count))
-        run = Run(config, folder, parts)
+        processes.on_main(lambda: _check_and_open(config, chosen, folder, count))
+        run = Run(config, folder, chosen)
         use_threads(config.num_threads)
         run.workers  # noqa: B018 - a cluster without room says so now
     return run

@@ -110,7 +110,7 @@ def _backward(
         total_steps: that the minibatch stands for.
     """
     pixels = sum(value[0].numel() for value in decisions["observation"].values() if value.dtype == torch.uint8)
-    at_once = max(16, (_PIXELS if decisions[keys.CHUNK].device.type == "cpu" else _PIXELS_ON_GPU) // max(pixels, 1))
+    at_once = rows_at_once(pixels, decisions[keys.CHUNK].device.type)
     parts = list(shares[processes.rank()].split(at_once))
     # All take as many turns: gradients are exchanged in them.
     turns = max(-(-len(share) // at_once) for share in shares)
@@ -139,6 +139,11 @@ def _part(decisions: TensorDictBase, rows: torch.Tensor) -> TensorDictBase:
     blank[keys.STEP_MASK] = torch.zeros_like(blank[keys.STEP_MASK])
     blank["next", keys.STEP_MASK] = blank[keys.STEP_MASK]
     return blank
+
+
+def rows_at_once(pixels: int, device_type: str) -> int:
+    """Decisions whose activations are there together, each of so many numbers of images."""
+    return max(16, (_PIXELS if device_type == "cpu" else _PIXELS_ON_GPU) // max(pixels, 1))
 
 
 def ratios(wave: TensorDictBase, in_keys: Sequence[NestedKey], loss: LOOPLoss) -> TensorDictBase:

@@ -4,7 +4,9 @@ From five demonstrations per task to a policy post-trained by reinforcement lear
 
     python recipes/world_env.py smoke      # every stage for real, at most 6 minutes on 2 cores
     python recipes/world_env.py improve    # meant to raise held-out success: at most 60 minutes; extra vision
+    python recipes/world_env.py real-size --real-size.policy FOLDER ...    # pretrained parts: recipes/README.md
     python recipes/world_env.py improve --help
+    python recipes/world_env.py improve --dry-run [--gpus 8] [--gpu H100] [--matmul-share 0.3]    # its plan alone
 
 The same command continues an interrupted run: finished stages are skipped, the running one goes on from its last
 checkpoint, to the same weights bit for bit.
@@ -13,15 +15,17 @@ checkpoint, to the same weights bit for bit.
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 
 import processes
 import report
 from config import WorldEnvConfig
 from demonstrate import demonstrate
+from dry_run import dry_run, split
 from evaluate import evaluate
 from explore import explore
-from parts import COMPACT, Parts
+from parts import Parts
 from post_train import post_train
 from run import Run
 from sft import fine_tune
@@ -41,8 +45,9 @@ WORKS: dict[str, Work] = {
 }
 
 
-def run_all(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
-    """Runs what is not finished yet, then prints the table and writes the plots and the report."""
+def run_all(config: WorldEnvConfig, parts: Parts | None = None) -> None:
+    """Runs what is not finished yet, then prints the table and writes the plots and the report; the parts are those
+    that the settings name, unless others are given."""
     run = open_run(config, parts)
     with closing(run.folder.loggers), closing(run):
         run_stages(run, WORKS)
@@ -73,5 +78,15 @@ def summarize(run: Run) -> None:
         print(f"warning: the report could not be written ({error}); after a remedy: {again}", file=sys.stderr)
 
 
+def main(arguments: Sequence[str]) -> int:
+    """The command; with ``--dry-run`` only its plan."""
+    planned, settings = split(arguments)
+    config = parse(settings)
+    if planned is not None:
+        return 1 if dry_run(config, planned) else 0
+    run_all(config)
+    return 0
+
+
 if __name__ == "__main__":
-    run_all(parse(sys.argv[1:]))
+    sys.exit(main(sys.argv[1:]))

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import torch
 from real_size_row import Row
 from tensordict import TensorDict
 from torch import Tensor, nn
-from transformers import AutoModelForImageTextToText, LlavaOnevisionConfig
+from transformers import AutoModelForImageTextToText
 
+from published_sizes import INSTRUCTION, QWEN2_7B, WordTokens, llava_onevision
 from worldenv_trl import keys
 from worldenv_trl.language import instructions_of
 from worldenv_trl.reflectors import VLMReflector, VLMReflectorConfig
@@ -21,25 +21,12 @@ from worldenv_trl.world_models import DiffusionWorldModel, DiffusionWorldModelCo
 from worldenv_trl.world_models.base import MEMORY_POSES, PADDED_ACTION_DIM, PADDED_ACTIONS, POSES
 from worldenv_trl.world_models.diffusion_training import denoising_loss
 
-INSTRUCTION = "put the wine bottle on top of the cabinet"
 IMAGE_SIZE = 256  # px, LIBERO's
 FRONT = look_at("agentview", (0.66, 0.0, 1.61), (0.0, 0.0, 0.9), 45.0)
 
 # ----------------------------------------------------------------------------------------------------- reflector
 
 
-def llava_onevision(**text: Any) -> LlavaOnevisionConfig:
-    """llava-hf/llava-onevision-qwen2-*-ov-hf's sizes: SigLIP-so400m at 384 px before Qwen2."""
-    return LlavaOnevisionConfig(text_config={"model_type": "qwen2", "vocab_size": 152064, **text})
-
-
-QWEN2_7B: dict[str, Any] = {
-    "hidden_size": 3584,
-    "intermediate_size": 18944,
-    "num_hidden_layers": 28,
-    "num_attention_heads": 28,
-    "num_key_value_heads": 4,
-}
 QWEN2_500M: dict[str, Any] = {
     "hidden_size": 896,
     "intermediate_size": 4864,
@@ -48,17 +35,6 @@ QWEN2_500M: dict[str, Any] = {
     "num_key_value_heads": 2,
     "tie_word_embeddings": True,
 }
-
-
-class WordTokens:
-    """One token a word: prompts come out about as long as with a real tokenizer."""
-
-    def __init__(self, video_token: int) -> None:
-        self._video_token = video_token
-
-    def __call__(self, text: str, add_special_tokens: bool = True) -> SimpleNamespace:
-        words = enumerate(text.replace("?", " ? ").split())
-        return SimpleNamespace(input_ids=[self._video_token if "<video>" in word else place for place, word in words])
 
 
 def make_reflector(**text: Any) -> VLMReflector:

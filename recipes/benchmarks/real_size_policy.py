@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial
 
 import torch
 from real_size_row import Row
-from tokenizers import Tokenizer, models, pre_tokenizers, processors
 from torch import Tensor, nn
 from transformers import LlavaConfig, PaliGemmaConfig, PretrainedConfig, SmolVLMConfig
 
+from published_sizes import INSTRUCTION, LLAMA_2_7B, openvla_oft_7b, words
 from worldenv_trl.keys import ACTION_DIM, STATE_DIM
 from worldenv_trl.policies.hf import HFConfig, HFPolicy
-from worldenv_trl.policies.prismatic import PrismaticConfig, dinosiglip_towers
+from worldenv_trl.policies.prismatic import PrismaticConfig
 
 CAMERAS = ("agentview", "wrist")
-INSTRUCTION = "put the wine bottle on top of the cabinet"
 IMAGE_SIZE = 256  # px, LIBERO's
 RANK = 32
 Inputs = tuple[dict[str, Tensor], Tensor, list[str]]
@@ -33,22 +31,6 @@ def siglip_so400m(image_size: int) -> dict:
         "patch_size": 14,
         "vision_use_head": False,
     }
-
-
-LLAMA_2_7B = {
-    "model_type": "llama",
-    "hidden_size": 4096,
-    "intermediate_size": 11008,
-    "num_hidden_layers": 32,
-    "num_attention_heads": 32,
-    "vocab_size": 32064,
-}
-
-
-def openvla_oft_7b() -> PrismaticConfig:
-    """OpenVLA-OFT: Llama-2-7B behind DINOv2-L and SigLIP-so400m at 224 px."""
-    towers = [dataclasses.asdict(tower) for tower in dinosiglip_towers()]
-    return PrismaticConfig(LLAMA_2_7B, {"image_size": 224, "towers": towers})
 
 
 def llava_7b() -> LlavaConfig:
@@ -100,18 +82,6 @@ def smolvlm_500m() -> SmolVLMConfig:
         "patch_size": 16,
     }
     return SmolVLMConfig(text_config=text, vision_config=vision, scale_factor=4, image_token_id=49190)
-
-
-def words() -> Tokenizer:
-    """One token a word: prompts come out about as long as with a real tokenizer."""
-    special = ["<s>", "<fake_token_around_image>", "<global-img>"]
-    known = [*special, *HFConfig.prompt.format(instruction=INSTRUCTION).replace(":", " : ").replace("?", " ? ").split()]
-    numbers = {word: number for number, word in enumerate(dict.fromkeys(["<unk>", *known]))}
-    tokenizer = Tokenizer(models.WordLevel(numbers, unk_token="<unk>"))
-    tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
-    tokenizer.add_special_tokens(special)
-    tokenizer.post_processor = processors.TemplateProcessing(single="<s> $A", special_tokens=[("<s>", numbers["<s>"])])
-    return tokenizer
 
 
 def make(backbone: PretrainedConfig | PrismaticConfig) -> HFPolicy:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import gc
-import weakref
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
+from peak_memory import PeakMemory
 from speeds import flops, speed
 
 
@@ -72,45 +70,6 @@ class Costs:
     def training_bytes(self) -> int:
         """All that a training step holds at its peak."""
         return self.training_weight_bytes + self.optimizer_bytes + self.training.peak_bytes
-
-
-class PeakMemory(TorchDispatchMode):
-    """The most bytes that tensors made inside it held at one time, by their storages' sizes and lives.
-
-    On the meta device attention is decomposed and its matrix counted; a fused kernel of a GPU holds none.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.peak = self._held = 0
-        self._known: set[int] = set()
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
-        for before in tree_leaves((args, kwargs)):
-            if isinstance(before, Tensor):
-                self._known.add(before.untyped_storage()._cdata)  # made outside, or counted
-        out = func(*args, **(kwargs or {}))
-        for after in tree_leaves(out):
-            if isinstance(after, Tensor):
-                self._count(after.untyped_storage())
-        return out
-
-    def met(self, tensor: Tensor) -> bool:
-        """Whether an operation has read it, or a view of it."""
-        return tensor.untyped_storage()._cdata in self._known
-
-    def _count(self, storage: torch.UntypedStorage) -> None:
-        key, size = storage._cdata, storage.nbytes()
-        if key in self._known:
-            return
-        self._known.add(key)
-        self._held += size
-        self.peak = max(self.peak, self._held)
-        weakref.finalize(storage, self._release, key, size)
-
-    def _release(self, key: int, size: int) -> None:
-        self._held -= size
-        self._known.discard(key)
 
 
 def costs(row: Row) -> Costs:

@@ -268,3 +268,10 @@ def test_the_command_that_converts_a_pickle_works(damaged):
     subprocess.run(["bash", "-c", command], check=True)
     policy = load_openvla_oft(damaged, **SETTINGS)
     torch.testing.assert_close(policy(observations())[keys.LOC], expected(), rtol=0, atol=1e-4)
+
+
+def test_on_the_meta_device_it_has_the_same_sizes_and_no_weights(released):
+    outline, policy = (load_openvla_oft(released, device=device, **SETTINGS) for device in ("meta", "cpu"))
+    assert {each.device.type for each in (*outline.parameters(), *outline.buffers())} == {"meta"}
+    shapes = {name: (value.shape, value.dtype) for name, value in policy.state_dict().items()}
+    assert {name: (value.shape, value.dtype) for name, value in outline.state_dict().items()} == shapes

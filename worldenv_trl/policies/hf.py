@@ -210,7 +210,7 @@ class HFPolicy(Policy, Pretrained):
                 ``owner/name`` of a repository of the Hub that holds these.
 
         Keyword Args:
-            device: of the parameters.
+            device: of the parameters; on ``meta`` no weights are read, only that their files are there is checked.
             settings: fields of :class:`HFConfig`.
 
         Raises:

@@ -58,13 +58,15 @@ def read_backbone(
 ) -> tuple[dict[str, Any], Tokenizer, PreTrainedModel]:
     """What :meth:`HFPolicy.from_backbone` needs of a folder: fields of its config, tokenizer and backbone.
 
+    On the device ``meta`` no weights are read.
+
     Raises:
         FileNotFoundError: if a file is missing.
         ValueError: if the weights are pickled, or the config is of no known family.
     """
     from transformers import AutoModelForImageTextToText
 
-    from worldenv_trl.policies.hf_backbone import backbone_config
+    from worldenv_trl.policies.hf_backbone import backbone_config, make_model
 
     folder = local_folder(folder)
     described = read_json(folder, "config.json")
@@ -77,6 +79,8 @@ def read_backbone(
         fields |= {name: tuple(images[name]) for name in ("image_mean", "image_std") if name in images}
     tokenizer = read_tokenizer(folder)
     with torch.device(device):
+        if torch.device(device).type == "meta":
+            return fields, tokenizer, make_model(config, dtype)
         model = AutoModelForImageTextToText.from_pretrained(folder, dtype=dtype, local_files_only=True).model
     return fields, tokenizer, model
 

@@ -69,18 +69,19 @@ class VideoLanguageModel(nn.Module):
         self._prompts: dict[str, tuple[list[int], list[int]]] = {}
 
     @classmethod
-    def load(cls, name: str, dtype: str = "auto") -> VideoLanguageModel:
+    def load(cls, name: str, dtype: str = "auto", device: str = "cpu") -> VideoLanguageModel:
         """From a local folder of transformers' layout, or ``owner/name`` of a repository on the Hub.
 
         Args:
             name: the folder or repository.
             dtype: of the weights: ``auto`` as they were saved, ``float32``, ``bfloat16``, ``float16``.
+            device: ``cpu``, or ``meta``: no weights are read, only that their files are there is checked.
 
         Raises:
             FileNotFoundError: if there is no such folder, or a file in it is missing.
             ValueError: for a model of another class, or weights that are only there as pickles.
         """
-        from transformers import AutoModelForImageTextToText, AutoTokenizer
+        from transformers import AutoConfig, AutoModelForImageTextToText, AutoTokenizer
 
         folder = hub.download(name, _FILES) if hub.is_repo_id(name) else Path(name)
         for path in (folder, folder / "config.json"):
@@ -104,6 +105,14 @@ class VideoLanguageModel(nn.Module):
                 "LLaVA-Video checkpoint in the layout of transformers"
             )
         tokenizer = AutoTokenizer.from_pretrained(folder)
+        if device == "meta":
+            config = AutoConfig.from_pretrained(folder)
+            saved = config.dtype or torch.float32
+            with torch.device("meta"):
+                model = AutoModelForImageTextToText.from_config(
+                    config, dtype=saved if dtype == "auto" else getattr(torch, dtype)
+                )
+            return cls(model, tokenizer, **_colours(folder))
         model = AutoModelForImageTextToText.from_pretrained(
             folder, dtype=dtype if dtype == "auto" else getattr(torch, dtype), use_safetensors=True
         )

@@ -1,0 +1,145 @@
+"""The parts at real size: pretrained ones of the local folders that ``config.real_size`` names."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from config import WorldEnvConfig
+from parts import COMPACT, PROPRIO, Part, Parts, instructions
+from worldenv_trl.policies import HFPolicy, Policy, load_openvla_oft
+from worldenv_trl.policies.hf_files import check_weights, read_json
+from worldenv_trl.reflectors import Reflector, VLMReflector, VLMReflectorConfig
+from worldenv_trl.reflectors.video_language_model import VideoLanguageModel
+from worldenv_trl.scenes import load_task
+from worldenv_trl.world_models import DiffusionWorldModel, DiffusionWorldModelConfig, WorldModel, load_diffusers
+
+NAMES = ("compact", "real-size")
+
+
+def parts_of(config: WorldEnvConfig) -> Parts:
+    """What the setting ``parts`` names.
+
+    Raises:
+        ValueError: for another name.
+    """
+    if config.parts not in NAMES:
+        raise ValueError(f"parts must be one of {', '.join(NAMES)}, got {config.parts!r}")
+    return REAL_SIZE if config.parts == "real-size" else COMPACT
+
+
+def make_policy(config: WorldEnvConfig, device: str = "cpu") -> HFPolicy:
+    """OpenVLA-OFT's checkpoint, or its recipe over a vision-language model.
+
+    Raises:
+        FileNotFoundError: if the folder lacks a file.
+        ValueError: if none is named, or what is in it does not suit the run.
+    """
+    folder = _named(config, "policy")
+    settings = policy_settings(config)
+    if read_json(folder, "config.json").get("model_type") != "openvla":
+        return HFPolicy.from_backbone(folder, device=device, chunk_length=config.chunk_length, **settings)
+    if (config.sft.cameras and len(config.sft.cameras) != 2) or len(config.cameras) != 2:
+        raise ValueError(
+            f"{folder} was trained with 2 cameras, got {len(settings['cameras'])} ({', '.join(settings['cameras'])}): "
+            "--cameras agentview wrist, and leave --sft.cameras out"
+        )
+    return load_openvla_oft(folder, statistics=config.real_size.statistics or None, device=device, **settings)
+
+
+def policy_settings(config: WorldEnvConfig) -> dict[str, Any]:
+    """Fields of :class:`~worldenv_trl.policies.HFConfig` that the run decides."""
+    return {
+        "instructions": instructions(config),
+        "cameras": config.sft.cameras or config.cameras,
+        "image_size": config.image_size,
+        "proprio": PROPRIO,
+        "lora_rank": config.post_train.lora_rank,
+        "dtype": config.real_size.dtype,
+        "gradient_checkpointing": True,
+    }
+
+
+def make_world_model(config: WorldEnvConfig, device: str = "cpu") -> DiffusionWorldModel:
+    """EVAC's model, as much of it pretrained as the folder holds.
+
+    Raises:
+        FileNotFoundError: if the folder lacks a file.
+        ValueError: if none is named, or what is in it does not suit the run.
+    """
+    folder = _named(config, "world_model")
+    sizes = DiffusionWorldModelConfig.sizes_of(folder)
+    if device != "meta":
+        model = DiffusionWorldModel(world_model_config(config, **sizes))
+        load_diffusers(model, folder)
+        return model
+    for part in sizes:
+        check_weights(folder / part)
+    return outlined_world_model(config, **sizes)
+
+
+def outlined_world_model(config: WorldEnvConfig, **sizes: Any) -> DiffusionWorldModel:
+    """On the meta device."""
+    with torch.device("meta"):
+        return DiffusionWorldModel(world_model_config(config, **sizes)).to("meta")  # diffusers makes some on the CPU
+
+
+def world_model_config(config: WorldEnvConfig, **sizes: Any) -> DiffusionWorldModelConfig:
+    """The run's cameras and sizes; ``sizes`` are the network's."""
+    tasks = [load_task(task) for task in config.tasks]
+    cameras = {name: {task.language: task.camera(name) for task in tasks} for name in config.cameras}
+    return DiffusionWorldModelConfig.for_cameras(
+        cameras,
+        image_size=config.image_size,
+        chunk_length=config.chunk_length,
+        frame_size=config.real_size.frame_size,
+        rows_per_call=config.real_size.rows_per_call,
+        num_denoise_steps=config.world_model.denoise_steps,
+        gradient_checkpointing=True,
+        **sizes,
+    )
+
+
+def make_reflector(config: WorldEnvConfig, device: str = "cpu") -> VLMReflector:
+    """A reward head on a frozen video language model.
+
+    Raises:
+        FileNotFoundError: if the folder lacks a file.
+        ValueError: if none is named, or it holds a model of another class.
+    """
+    settings = reflector_config(config, str(_named(config, "reflector")))
+    return VLMReflector(settings, vlm=VideoLanguageModel.load(settings.model, settings.dtype, device)).to(device)
+
+
+def reflector_config(config: WorldEnvConfig, model: str) -> VLMReflectorConfig:
+    settings = config.real_size
+    return VLMReflectorConfig(
+        model,
+        instructions(config),
+        camera=config.cameras[0],
+        num_frames=settings.num_frames,
+        score_every=settings.score_every,
+        dtype=settings.dtype,
+    )
+
+
+def _named(config: WorldEnvConfig, part: str) -> Path:
+    folder: Path | None = getattr(config.real_size, part)
+    option = f"--real-size.{part.replace('_', '-')}"
+    if folder is None:
+        raise ValueError(f"{option} names no folder: parts=real-size needs one (recipes/README.md, Real sizes)")
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{option}: there is no folder {folder}")
+    return folder
+
+
+REAL_SIZE = Parts(
+    policy=Part[Policy](make_policy, HFPolicy.from_pretrained, partial(make_policy, device="meta")),
+    world_model=Part[WorldModel](
+        make_world_model, DiffusionWorldModel.from_pretrained, partial(make_world_model, device="meta")
+    ),
+    reflector=Part[Reflector](make_reflector, VLMReflector.from_pretrained, partial(make_reflector, device="meta")),
+)

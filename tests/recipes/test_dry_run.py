@@ -1,0 +1,65 @@
+"""The dry run of the compact parts, and its options."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+import dry_run as dry
+import world_env
+from parts import COMPACT, make_policy
+from rehearsal import rehearse
+from worldenv_trl import keys
+
+
+def test_its_options_stand_anywhere_among_the_settings():
+    chosen, settings = dry.split(["smoke", "--gpus", "2", "--seed", "3", "--dry-run", "--matmul-share=.4"])
+    assert settings == ["smoke", "--seed", "3"]
+    assert (chosen.gpus, chosen.gpu, chosen.matmul_share) == (2, None, 0.4)
+    assert dry.split(["smoke", "--seed", "3"]) == (None, ["smoke", "--seed", "3"])
+
+
+def test_a_preset_is_planned_in_its_order_and_no_folder_is_touched(tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert world_env.main(["smoke", "--run-dir", str(folder), "--dry-run", "--gpu", "H200"]) == 0
+    printed = capsys.readouterr().out
+    assert not folder.exists() and "1 x H200 (989.0 TFLOP/s and 141.0 GB each) at 30%" in printed
+    places = [printed.index(f"\n{name} ") for name in ("demonstrate", "sft", "explore", "post_train", "evaluate")]
+    assert places == sorted(places)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--gpus", "0"], "--gpus must be at least 1, got 0"),
+        (["--matmul-share", "1.5"], "--matmul-share must lie above 0 and at most at 1, got 1.5"),
+        (["--image-size", "100"], "image_size must be a multiple of 16 px and at least 32, got 100"),
+        (["--parts", "large"], "parts must be one of compact, real-size, got 'large'"),
+    ],
+)
+def test_bad_options_and_settings_are_one_line(options, message, capsys):
+    assert world_env.main(["smoke", "--dry-run", *options]) == 1
+    assert capsys.readouterr().out.splitlines()[-1] == f"error: {message}"
+
+
+def test_costs_of_the_compact_policy_are_what_torch_counts(tiny):
+    found = rehearse(tiny, COMPACT)
+    assert not found.problems and set(found.calls) == {
+        "decide",
+        "sft",
+        "update",
+        "imagine",
+        "dream",
+        "see",
+        "judge",
+        "learn",
+    }
+    policy = make_policy(tiny)
+    policy.post_training_parameters(tiny.post_train.lora_rank)
+    images = {"agentview": torch.zeros(5, 3, 64, 64, dtype=torch.uint8)}
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        policy.predict(images, torch.zeros(5, keys.STATE_DIM), ["open the top drawer of the cabinet"] * 5)
+    assert found.calls["decide"].flops == pytest.approx(counter.get_total_flops() / 5, rel=0.05)
+    assert found.sizes["policy"].trainable < found.sizes["policy"].parameters
+    assert found.sizes["sft"].trainable == found.sizes["sft"].parameters
