@@ -161,7 +161,7 @@ def test_settings_out_of_range_are_refused(settings, message):
 
 
 def test_cameras_are_needed(model):
-    with pytest.raises(ValueError, match="cameras must name at least one camera"):
+    with pytest.raises(ValueError, match="cameras must give every camera"):
         DiffusionWorldModel(DiffusionWorldModelConfig(**SMALL))
     asked = ask(model, 1)
     del asked[memory_key("wrist")]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from worldenv_trl.robot.camera import Camera
 
-__all__ = ["Calibrations", "plain_cameras"]
+__all__ = ["Calibrations", "check_instructions", "plain_cameras"]
 
 
 def plain_cameras(cameras: Mapping[str, Mapping[str, Camera]]) -> dict[str, dict[str, dict[str, Any]]]:
@@ -27,6 +27,16 @@ def plain_cameras(cameras: Mapping[str, Mapping[str, Camera]]) -> dict[str, dict
             f"task.camera('agentview') for task in env.tasks}}}}, got {cameras!r}"
         )
     return {name: {text: asdict(camera) for text, camera in each.items()} for name, each in cameras.items()}
+
+
+def check_instructions(cameras: Mapping[str, Mapping[str, Any]], config: str) -> None:
+    """Raises ``ValueError`` unless a ``config`` (its name) has every camera for the same instructions, at least one."""
+    texts = {tuple(each) for each in cameras.values()}
+    if len(texts) != 1 or not next(iter(texts)):
+        raise ValueError(
+            "cameras must give every camera for the same instructions, at least one: build the config with "
+            f"{config}.for_cameras({{name: {{instruction: camera}}}})"
+        )
 
 
 class Calibrations:

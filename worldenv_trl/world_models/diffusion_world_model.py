@@ -22,7 +22,7 @@ from worldenv_trl.world_models.base import (
     WorldModel,
     memory_key,
 )
-from worldenv_trl.world_models.calibrations import Calibrations
+from worldenv_trl.world_models.calibrations import Calibrations, check_instructions
 from worldenv_trl.world_models.cells import to_float, to_uint8
 from worldenv_trl.world_models.diffusion_conditioning import ContextTokens, ViewGeometry, resized
 from worldenv_trl.world_models.diffusion_config import CONDITION_CHANNELS, DiffusionWorldModelConfig
@@ -74,11 +74,7 @@ class DiffusionWorldModel(WorldModel, Pretrained):
     def __init__(self, config: DiffusionWorldModelConfig) -> None:
         from diffusers import AutoencoderKL
 
-        if not config.instructions or len({tuple(each) for each in config.cameras.values()}) > 1:
-            raise ValueError(
-                "cameras must name at least one camera, with the same instructions, at least one, for each: "
-                "build the config with DiffusionWorldModelConfig.for_cameras"
-            )
+        check_instructions(config.cameras, "DiffusionWorldModelConfig")
         super().__init__(
             cameras=tuple(config.cameras),
             image_size=config.image_size,

@@ -24,7 +24,7 @@ from worldenv_trl.world_models.base import (
     memory_key,
     reference_key,
 )
-from worldenv_trl.world_models.calibrations import Calibrations, plain_cameras
+from worldenv_trl.world_models.calibrations import Calibrations, check_instructions, plain_cameras
 from worldenv_trl.world_models.cells import from_cells, to_cells, to_float, to_uint8
 from worldenv_trl.world_models.denoiser import Denoiser, View
 from worldenv_trl.world_models.flow_matching import sample, seeded_noise
@@ -153,11 +153,7 @@ class VideoWorldModel(WorldModel, Pretrained):
     config_class = VideoWorldModelConfig
 
     def __init__(self, config: VideoWorldModelConfig) -> None:
-        if not config.instructions or len({tuple(each) for each in config.cameras.values()}) > 1:
-            raise ValueError(
-                "cameras must give every camera for the same instructions, at least one: build the config with "
-                "VideoWorldModelConfig.for_cameras({name: {instruction: camera}})"
-            )
+        check_instructions(config.cameras, "VideoWorldModelConfig")
         super().__init__(
             cameras=tuple(config.cameras),
             image_size=config.image_size,

@@ -103,8 +103,8 @@ def socket_address(address: str) -> tuple[int, Any]:
         ValueError: for anything else.
 
     Examples:
-        >>> socket_address("unix:/tmp/pi0.sock")[1], socket_address("localhost:8765")[1]
-        ('/tmp/pi0.sock', ('localhost', 8765))
+        >>> socket_address("unix:pi0.sock")[1], socket_address("localhost:8765")[1]
+        ('pi0.sock', ('localhost', 8765))
     """
     if address.startswith("unix:") and len(address) > len("unix:"):
         return socket.AF_UNIX, address[len("unix:") :]
