@@ -78,8 +78,8 @@ def dry_run(config: WorldEnvConfig, chosen: argparse.Namespace, parts: Parts | N
     for stage in plans:
         if stage.sharded_bytes <= machine.memory < stage.whole_bytes:
             print(
-                f"note: {stage.name} fits a {machine.name} sharded alone; --parallel fsdp shards what is trained, and a "
-                "whole copy of it stays in every process to act with"
+                f"note: {stage.name} fits a {machine.name} sharded alone; --parallel fsdp shards what is trained, and "
+                "a whole copy of it stays in every process to act with"
             )
     return _refused(too_large(plans, machine))
 
