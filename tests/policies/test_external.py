@@ -6,7 +6,6 @@ import copy
 import dataclasses
 import multiprocessing
 import os
-import pickle
 import signal
 import socket
 import struct
@@ -15,6 +14,7 @@ import sys
 import threading
 import time
 
+import cloudpickle
 import numpy as np
 import pytest
 import torch
@@ -125,7 +125,7 @@ def test_a_copy_and_a_forked_process_have_connections_of_their_own():
         for ask in (
             lambda: external(observed()),
             lambda: external(observed()),
-            lambda: pickle.loads(pickle.dumps(external))(observed()),
+            lambda: cloudpickle.loads(cloudpickle.dumps(external))(observed()),
             lambda: copy.deepcopy(external)(observed()),
         ):
             ask()

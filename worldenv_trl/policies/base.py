@@ -146,3 +146,11 @@ class Policy(TensorDictModuleBase, abc.ABC):
         if image.dtype != torch.uint8 or tuple(image.shape) != (*batch, *size):
             raise ValueError(f"{key} must be uint8 {[*batch, *size]}, got {image.dtype} {list(image.shape)}")
         return image.reshape(-1, *size)
+
+
+def check_rank(rank: int, present: int) -> None:
+    """Raises ``ValueError`` for adapters of a negative rank, or of another than a policy has (``present``; 0: none)."""
+    if rank < 0:
+        raise ValueError(f"rank must not be negative, got {rank}")
+    if present not in (0, rank):
+        raise ValueError(f"this policy has adapters of rank {present}: it cannot get some of {rank}")

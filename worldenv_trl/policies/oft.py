@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from worldenv_trl.keys import ACTION_DIM, CHUNK_LENGTH, STATE_DIM
 from worldenv_trl.language import Vocabulary, split_words
-from worldenv_trl.policies.base import Policy
+from worldenv_trl.policies.base import Policy, check_rank
 from worldenv_trl.policies.heads import MLPResNet
 from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.vision import PretrainedEncoder
@@ -309,10 +309,7 @@ class OFTPolicy(Policy, Pretrained):
     def post_training_parameters(self, rank: int) -> dict[str, list[nn.Parameter]]:
         """Low-rank adapters (peft) on the backbone's linear layers, and both heads; at rank 0 the backbone itself, but
         for the pretrained encoder, instead of adapters."""
-        if rank < 0:
-            raise ValueError(f"rank must not be negative, got {rank}")
-        if self.config.lora_rank not in (0, rank):
-            raise ValueError(f"this policy has adapters of rank {self.config.lora_rank}: it cannot get some of {rank}")
+        check_rank(rank, self.config.lora_rank)
         if rank and not self.config.lora_rank:
             self.config = dataclasses.replace(self.config, lora_rank=rank)
             self._inject_adapters()
