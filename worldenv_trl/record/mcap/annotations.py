@@ -24,13 +24,19 @@ class Annotator:
         name: of the metadata record that announces a kind of annotation.
         length: entries of a rollout, by its number; raises ``KeyError`` for one that is not there.
         time: when (ns) a step of a rollout plays.
+        known: layouts that the file has announced already.
     """
 
     def __init__(
-        self, file: McapFile, name: str, length: Callable[[int], int], time: Callable[[int, int], int]
+        self,
+        file: McapFile,
+        name: str,
+        length: Callable[[int], int],
+        time: Callable[[int, int], int],
+        known: Sequence[Layout] = (),
     ) -> None:
         self._file, self._name, self._length, self._time = file, name, length, time
-        self._known: list[Layout] = []
+        self._known = list(known)
 
     def write(self, entries: TensorDictBase, numbers: Sequence[int]) -> None:
         """Entries [*B, T] of the rollouts with these numbers; raises ``ValueError`` where they do not fit."""

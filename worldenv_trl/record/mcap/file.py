@@ -9,16 +9,19 @@ import json
 import os
 import shutil
 import time
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from mcap.records import Metadata
 
+from worldenv_trl.record.mcap.index import HEAD, parsed
 from worldenv_trl.record.mcap.records import McapWriter
 from worldenv_trl.record.mcap.scan import METADATA_COPY
 
-__all__ = ["PARTIAL_SUFFIX", "REPAIRED_SUFFIX", "McapFile", "check_target"]
+__all__ = ["PARTIAL_SUFFIX", "REPAIRED_SUFFIX", "McapFile", "check_target", "still_holds"]
 
 PARTIAL_SUFFIX, REPAIRED_SUFFIX = ".partial.mcap", ".repaired.mcap"
 FLUSH_SECONDS = 0.5
@@ -56,34 +59,87 @@ def _check_free(path: Path, overwrite: bool) -> None:
         raise FileExistsError(f"{path} exists: pass overwrite=True to replace it")
 
 
+def still_holds(path: str | os.PathLike, state: Mapping[str, Any]) -> bool:
+    """Whether a file, finished or not, begins with what was in it when :meth:`McapFile.state_dict` gave ``state``."""
+    left, crc = int(state["size"]), 0
+    try:
+        with open(_found(Path(path)), "rb") as file:
+            while left and (data := file.read(min(left, 2**20))):
+                left, crc = left - len(data), zlib.crc32(data, crc)
+    except FileNotFoundError:
+        return False
+    return not left and crc == state["crc"]
+
+
+def _found(path: Path) -> Path:
+    """Where the bytes of a file are: under the name of an unfinished one, if there is such."""
+    partial = path.with_name(path.stem + PARTIAL_SUFFIX)
+    return partial if partial.exists() else path
+
+
 class McapFile:
     """Writes ``<name>.partial.mcap`` and gives it its name when it is complete.
 
     Everything before the last :meth:`flush` survives the death of the process; :meth:`flush_if_due` flushes when the
     last flush is :data:`FLUSH_SECONDS` old.
 
+    With a ``state`` of :meth:`state_dict` it goes on from there: what was written after it goes, finished or not.
+
     Raises:
-        ValueError: for a path with another suffix.
+        ValueError: for a path with another suffix, or a ``state`` whose bytes are no longer there.
         FileExistsError: if the file, or an unfinished one of that name, exists and ``overwrite`` is False; if another
             writer is at work on it.
         OSError: from any method, when the disk is full; what is complete stays in the partial file.
     """
 
-    def __init__(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
-        self.path, self._overwrite = Path(path), overwrite
-        self.partial = check_target(self.path, overwrite)
+    def __init__(
+        self, path: str | os.PathLike, *, overwrite: bool = False, state: Mapping[str, Any] | None = None
+    ) -> None:
+        self.path, self._overwrite = Path(path), overwrite or state is not None
+        self.partial = check_target(self.path, self._overwrite)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = self._open_locked()
+        if state is not None and not still_holds(self.path, state):
+            raise ValueError(f"{_found(self.path)} is cut short, damaged or gone: it can not be continued")
+        if state is not None and not self.partial.exists():
+            os.replace(self.path, self.partial)  # it was finished, its writer's work was not
+        self._file = self._open_locked(0 if state is None else int(state["size"]))
         self.closed = False
         self._writer = McapWriter(self._file, _CHUNK_BYTES)
         self._schemas: dict[tuple[str, bytes], int] = {}
         self._channels: dict[str, int] = {}
         self._metadata: list[tuple[str, dict[str, str]]] = []
         self._metadata_bytes = 0
+        if state is not None:
+            self._resume(state)
+            return
         self._call(self._writer.start, "worldenv_trl")
         self.flush()
 
-    def _open_locked(self) -> BinaryIO:
+    def _resume(self, state: Mapping[str, Any]) -> None:
+        self._writer.resume(bytes(state["index"]), int(state["crc"]))
+        self._schemas, self._channels = self._writer.schemas, self._writer.channels
+        with open(self.partial, "rb") as file:
+            for place in self._writer.metadata:
+                file.seek(place.offset)
+                record = parsed(Metadata, file.read(place.length)[HEAD.size :])
+                assert isinstance(record, Metadata)  # these bytes have the checksum of the state
+                self._note(record.name, record.metadata)
+        self._flushed = time.monotonic()
+
+    def state_dict(self) -> dict[str, Any]:
+        """From where another one, given it as ``state``, writes on. What was written is on the disk by then."""
+        self.flush()
+        self._call(os.fsync, self._file.fileno())
+        index = np.frombuffer(self._call(self._writer.index), np.uint8)
+        return {"size": self._file.tell(), "crc": self._writer.crc, "index": index}
+
+    @property
+    def metadata(self) -> list[tuple[str, dict[str, str]]]:
+        """What :meth:`write_metadata` was given, in order."""
+        return list(self._metadata)
+
+    def _open_locked(self, size: int) -> BinaryIO:
+        """The partial file, of which ``size`` bytes are kept."""
         while True:
             known = self.partial.exists()
             file = open(self.partial, "ab")  # noqa: SIM115 - closed by close() or abort(); "a": nothing is lost yet
@@ -102,8 +158,8 @@ class McapFile:
             if known and file.tell() and not self._overwrite:
                 file.close()
                 raise FileExistsError(_UNFINISHED.format(self.partial))
-            file.truncate(0)
-            file.seek(0)
+            file.truncate(size)
+            file.seek(size)
             return file
 
     def require_space(self, needed: int) -> None:
@@ -118,6 +174,9 @@ class McapFile:
 
     def write_metadata(self, name: str, values: Mapping[str, str]) -> None:
         self._call(self._writer.add_metadata, name, dict(values))
+        self._note(name, values)
+
+    def _note(self, name: str, values: Mapping[str, str]) -> None:
         self._metadata.append((name, dict(values)))
         self._metadata_bytes += sum(len(key) + len(value) for key, value in values.items())
 

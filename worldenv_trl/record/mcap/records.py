@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from typing import BinaryIO
 
 import numpy as np
 import zstandard
-from mcap.data_stream import RecordBuilder
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
@@ -41,6 +42,14 @@ _HEAD = np.dtype(
     ]
 )
 _FOOTER = struct.Struct("<BQQQ")
+_INDEXED: tuple[tuple[Opcode, type[McapRecord]], ...] = (
+    (Opcode.SCHEMA, Schema),
+    (Opcode.CHANNEL, Channel),
+    (Opcode.STATISTICS, Statistics),
+    (Opcode.CHUNK_INDEX, ChunkIndex),
+    (Opcode.ATTACHMENT_INDEX, AttachmentIndex),
+    (Opcode.METADATA_INDEX, MetadataIndex),
+)
 
 
 class McapWriter:
@@ -52,6 +61,7 @@ class McapWriter:
 
     def __init__(self, stream: BinaryIO, chunk_size: int) -> None:
         self._stream, self._chunk_size = stream, chunk_size
+        self.crc = 0  # of all that was written
         self._compressor = zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True)
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
@@ -63,12 +73,47 @@ class McapWriter:
         self._begin_chunk()
 
     def start(self, library: str) -> None:
-        self._stream.write(_MAGIC + _bytes(Header(profile="", library=library)))
+        self._write(_MAGIC + _bytes(Header(profile="", library=library)))
+
+    def resume(self, index: bytes, crc: int) -> None:
+        """Goes on behind what a writer had written when it gave this :meth:`index` and had this :attr:`crc`."""
+        found: dict[int, list] = {opcode: [] for opcode, _ in _INDEXED}
+        kinds, stream = dict(_INDEXED), ReadDataStream(io.BytesIO(index))
+        while stream.count < len(index):
+            opcode, _ = stream.read1(), stream.read8()
+            found[opcode].append(kinds[Opcode(opcode)].read(stream))
+        self._schemas, self._channels = found[Opcode.SCHEMA], found[Opcode.CHANNEL]
+        self._chunks, self._attachments = found[Opcode.CHUNK_INDEX], found[Opcode.ATTACHMENT_INDEX]
+        self._metadata, (counts,) = found[Opcode.METADATA_INDEX], found[Opcode.STATISTICS]
+        self._counts, self.crc = dict(counts.channel_message_counts), crc
+
+    def index(self) -> bytes:
+        """The records that would end the file if it ended here, before the offsets."""
+        return b"".join(group for _, group in self._groups())
+
+    @property
+    def schemas(self) -> dict[tuple[str, bytes], int]:
+        """Numbers of the schemas, by name and content."""
+        return {(schema.name, schema.data): schema.id for schema in self._schemas}
+
+    @property
+    def channels(self) -> dict[str, int]:
+        """Numbers of the channels, by topic."""
+        return {channel.topic: channel.id for channel in self._channels}
+
+    @property
+    def metadata(self) -> list[MetadataIndex]:
+        """Where the metadata records are."""
+        return list(self._metadata)
+
+    def _write(self, data: bytes) -> None:
+        self._stream.write(data)
+        self.crc = zlib.crc32(data, self.crc)
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
         record = _bytes(Metadata(name=name, metadata=values))
         self._metadata.append(MetadataIndex(offset=self._stream.tell(), length=len(record), name=name))
-        self._stream.write(record)
+        self._write(record)
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         record = _bytes(Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data))
@@ -83,7 +128,7 @@ class McapWriter:
                 media_type=media_type,
             )
         )
-        self._stream.write(record)
+        self._write(record)
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
         schema = Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
@@ -181,24 +226,15 @@ class McapWriter:
             )
         )
         self._begin_chunk()
-        self._stream.write(b"".join((record, *indices)))
+        self._write(b"".join((record, *indices)))
 
     def finish(self) -> None:
         """Writes the index that ends a file."""
         self.end_chunk()
-        self._stream.write(_bytes(DataEnd(data_section_crc=0)))
+        self._write(_bytes(DataEnd(data_section_crc=0)))
         start = self._stream.tell()
-        groups: list[tuple[Opcode, list[McapRecord]]] = [
-            (Opcode.SCHEMA, self._schemas),
-            (Opcode.CHANNEL, self._channels),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.ATTACHMENT_INDEX, self._attachments),
-            (Opcode.METADATA_INDEX, self._metadata),
-        ]
         summary, offsets = b"", []
-        for opcode, records in groups:
-            group = b"".join(map(_bytes, records))
+        for opcode, group in self._groups():
             if group:
                 offsets.append(
                     SummaryOffset(group_opcode=opcode, group_start=start + len(summary), group_length=len(group))
@@ -206,7 +242,19 @@ class McapWriter:
             summary += group
         offset_start = start + len(summary)
         summary += b"".join(map(_bytes, offsets)) + _FOOTER.pack(Opcode.FOOTER, 20, start, offset_start)
-        self._stream.write(summary + struct.pack("<I", zlib.crc32(summary)) + _MAGIC)
+        self._write(summary + struct.pack("<I", zlib.crc32(summary)) + _MAGIC)
+
+    def _groups(self) -> list[tuple[Opcode, bytes]]:
+        """The records of the index, kind by kind."""
+        records: dict[Opcode, list] = {
+            Opcode.SCHEMA: self._schemas,
+            Opcode.CHANNEL: self._channels,
+            Opcode.STATISTICS: [self._statistics()],
+            Opcode.CHUNK_INDEX: self._chunks,
+            Opcode.ATTACHMENT_INDEX: self._attachments,
+            Opcode.METADATA_INDEX: self._metadata,
+        }
+        return [(opcode, b"".join(map(_bytes, records[opcode]))) for opcode, _ in _INDEXED]
 
     def _statistics(self) -> Statistics:
         return Statistics(

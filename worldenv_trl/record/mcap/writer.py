@@ -15,7 +15,7 @@ from torch import Tensor
 from worldenv_trl.keys import INSTRUCTION, STEP_MASK, SUCCESS
 from worldenv_trl.record.mcap.annotations import Annotator
 from worldenv_trl.record.mcap.encoder import PERIOD_NS, RolloutEncoder
-from worldenv_trl.record.mcap.file import McapFile
+from worldenv_trl.record.mcap.file import McapFile, still_holds
 from worldenv_trl.record.mcap.layout import Layout, executed_entries, leaves
 
 __all__ = ["FORMAT", "VERSION", "RolloutWriter", "open_file"]
@@ -104,14 +104,56 @@ class RolloutWriter:
         attachments: Mapping[str, bytes | str | os.PathLike] | None = None,
         overwrite: bool = False,
     ) -> None:
-        self.path = Path(path)
-        self._file = open_file(path, metadata, attachments, overwrite)
+        self._begin(path, open_file(path, metadata, attachments, overwrite))
+
+    @classmethod
+    def resumed(cls, path: str | os.PathLike, state: Mapping[str, Any]) -> Self:
+        """Continues a recording, finished or not, as its writer would have after it gave ``state``: what was written
+        later goes.
+
+        Args:
+            path: of the recording.
+            state: of :meth:`state_dict`.
+
+        Raises:
+            ValueError: if what was written by then is no longer there, bit for bit (:meth:`still_holds`).
+            FileExistsError: if another writer is at work on it.
+        """
+        writer = cls.__new__(cls)
+        writer._begin(path, McapFile(path, state=state))
+        return writer
+
+    still_holds = staticmethod(still_holds)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What :meth:`resumed` continues from; what was written by now is on the disk, as far as a program can see."""
+        if self._file.closed:
+            raise ValueError(f"the writer of {self.path} is closed")
+        return self._file.state_dict()
+
+    def _begin(self, path: str | os.PathLike, file: McapFile) -> None:
+        """With what ``file`` says of itself."""
+        self.path, self._file = Path(path), file
         self._encoders: list[RolloutEncoder] = []
         self._raw_bytes = 0
         self._starts: list[tuple[int, int, int]] = []  # of each rollout: time (ns), its layout, its entries
         self._time = 0
-        self._annotator = Annotator(self._file, f"{FORMAT}.annotation", self._length, self._step_time)
         self._writing = False  # half of a write must not look complete
+        annotated: list[Layout] = []
+        for name, values in file.metadata:
+            kind = name.removeprefix(f"{FORMAT}.")
+            if kind not in ("layout", "write", "annotation"):
+                continue
+            record = json.loads(values["json"])
+            if kind == "layout":
+                self._add_encoder(Layout.from_json(record))
+            elif kind == "annotation":
+                annotated.append(Layout.from_json(record["layout"]))
+            else:
+                for length in record["lengths"]:
+                    self._note_rollout(record["layout"], length)
+                self._raw_bytes += _raw_bytes(self._encoders[record["layout"]].layout, sum(record["lengths"]))
+        self._annotator = Annotator(file, f"{FORMAT}.annotation", self._length, self._step_time, annotated)
 
     def write(self, rollouts: TensorDictBase) -> list[int]:
         """Appends rollouts ``[*B, T]`` with their root and next entries; one action or one decision per entry.
@@ -136,7 +178,7 @@ class RolloutWriter:
         layout = Layout.of(flat, texts, valid)
         lengths = valid.sum(-1)
         texts = {path: _row_texts(path, value, valid.shape, lengths) for path, value in texts.items()}
-        raw = sum(int(lengths.sum()) * e.nbytes for e in (*layout.images, *layout.numbers))
+        raw = _raw_bytes(layout, int(lengths.sum()))
         self._file.require_space(int(raw * self._compression()))
 
         index = self._layout_index(layout)
@@ -171,10 +213,13 @@ class RolloutWriter:
         layouts = [encoder.layout for encoder in self._encoders]
         if layout not in layouts:
             self._file.write_metadata(f"{FORMAT}.layout", {"json": json.dumps(layout.to_json())})
-            prefix = f"/layout_{len(layouts) + 1}" if layouts else ""
-            self._encoders.append(RolloutEncoder(self._file, layout, prefix))
+            self._add_encoder(layout)
             return len(layouts)
         return layouts.index(layout)
+
+    def _add_encoder(self, layout: Layout) -> None:
+        prefix = f"/layout_{len(self._encoders) + 1}" if self._encoders else ""
+        self._encoders.append(RolloutEncoder(self._file, layout, prefix))
 
     def _write_row(self, index: int, row: dict[tuple[str, ...], Tensor], length: int) -> None:
         """One rollout: its values [T, ...] by path."""
@@ -184,8 +229,11 @@ class RolloutWriter:
             steps = range(begin, min(begin + _STEPS_AT_ONCE, length))
             values = {key: value[begin : steps.stop] for key, value in row.items()}
             encoder.steps([number] * len(steps), list(steps), [start] * len(steps), values)
-        self._starts.append((start, index, length))
-        self._time = start + encoder.duration(length)
+        self._note_rollout(index, length)
+
+    def _note_rollout(self, index: int, length: int) -> None:
+        self._starts.append((self._time, index, length))
+        self._time += self._encoders[index].duration(length)
 
     def _length(self, number: int) -> int:
         if not 0 <= number < len(self._starts):
@@ -243,6 +291,10 @@ class RolloutWriter:
             self._file.abort()
         else:
             self._file.close_partial()
+
+
+def _raw_bytes(layout: Layout, entries: int) -> int:
+    return entries * sum(e.nbytes for e in (*layout.images, *layout.numbers))
 
 
 def _outcome(flat: dict[tuple[str, ...], Tensor], row: int, length: int) -> str:
