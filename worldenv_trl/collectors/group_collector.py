@@ -309,18 +309,20 @@ class GroupCollector(BaseCollector):
         torch.manual_seed(seed)
         return self.env.set_seed(seed, static_seed=static_seed)
 
-    def state_dict(self) -> OrderedDict[str, Any]:
-        """Progress, the policy's weights and, of an env that has one, its ``order_state()``: from which initial states
-        and with which noise its next wave begins."""
-        policy = self.policy.state_dict() if isinstance(self.policy, nn.Module) else {}
-        progress = {"groups": self._groups, "frames": self._frames, "iter": self._iter}
+    def state_dict(self, *, weights: bool = True) -> OrderedDict[str, Any]:
+        """Progress, the policy's weights (unless it stays as it is) and, of an env that has one, its ``order_state()``:
+        from which initial states and with which noise its next wave begins."""
         order = getattr(self.env, "order_state", None)
-        return OrderedDict(progress, policy_state_dict=policy, order=None if order is None else order())
+        progress = {"groups": self._groups, "frames": self._frames, "iter": self._iter}
+        state = OrderedDict(progress, order=None if order is None else order())
+        if weights:
+            state["policy_state_dict"] = self.policy.state_dict() if isinstance(self.policy, nn.Module) else {}
+        return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self._groups, self._frames = int(state_dict["groups"]), int(state_dict["frames"])
         self._iter = int(state_dict["iter"])
-        if isinstance(self.policy, nn.Module):
+        if isinstance(self.policy, nn.Module) and "policy_state_dict" in state_dict:
             self.policy.load_state_dict(state_dict["policy_state_dict"])
         if state_dict.get("order") is not None:
             self.env.load_order_state(state_dict["order"])

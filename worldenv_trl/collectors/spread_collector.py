@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -49,7 +49,7 @@ class SpreadCollector(GroupCollector):
         shares: parts of a wave; by default one for every 24 rollouts, 8 at most, but enough for all workers. Never
             more than it has groups (deals of them to the tasks).
         waves_at_once: collected together, and yielded one after the other. The policy and :attr:`exclude` must not
-            change between them, nor is the state between them one to continue from.
+            change between them. A state that is taken between them continues with those that were not yielded.
         others: of :class:`GroupCollector`.
 
     Raises:
@@ -102,6 +102,9 @@ class SpreadCollector(GroupCollector):
         self._work: Stored | None = workers.put(work)
         self._weights: tuple[TensorDictBase, Stored] | None = None
         self._ready: deque[TensorDictBase] = deque()
+        # Of waves that are ready: the env's order before they were drawn, and what their noise was drawn from.
+        self._drawn: deque[tuple[Any, int]] = deque()
+        self._noise: deque[int] = deque()  # of waves that were ready in a state that was loaded
         self._begun = 0  # waves, those that are ready included
 
     def _wave(self) -> TensorDictBase:
@@ -111,6 +114,7 @@ class SpreadCollector(GroupCollector):
                 count = min(count, self.total_groups // self.group_shape[0] - self._begun)
             self._ready.extend(self._waves(count))
             self._begun += count
+        self._drawn.popleft()
         return self._ready.popleft()
 
     def _waves(self, count: int) -> list[TensorDictBase]:
@@ -126,16 +130,29 @@ class SpreadCollector(GroupCollector):
 
     def _shares(self) -> list[Share]:
         """Of the next wave."""
+        order = _entry(self.env, "order_state")
+        noise = self._noise.popleft() if self._noise else int(torch.randint(2**62, ()))
+        self._drawn.append((None if order is None else order(), noise))
         starts = self.env.draw_starts().reshape(self.group_shape)
-        seeds = splitmix64(torch.arange(len(self._bounds)) ^ torch.randint(2**62, ())) & (2**62 - 1)
+        seeds = splitmix64(torch.arange(len(self._bounds)) ^ noise) & (2**62 - 1)
         return [
             Share(starts[first : first + count].clone(), seed, self.exclude)
             for (first, count), seed in zip(self._bounds, seeds.tolist(), strict=True)
         ]
 
+    def state_dict(self, *, weights: bool = True) -> OrderedDict[str, Any]:
+        """As of a :class:`GroupCollector`; of waves that are ready it holds from what they are collected again."""
+        state = super().state_dict(weights=weights)
+        if self._drawn:
+            state["order"] = self._drawn[0][0]
+        state["noise"] = [*(noise for _, noise in self._drawn), *self._noise]
+        return state
+
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         super().load_state_dict(state_dict)
         self._ready.clear()
+        self._drawn.clear()
+        self._noise = deque(state_dict.get("noise", ()))
         self._begun = self._groups // self.group_shape[0]
 
     def _stored_weights(self) -> Stored | None:
