@@ -5,16 +5,18 @@ Alone: ``python recipes/demonstrate.py improve --run-dir runs/improve``.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
-from tqdm import tqdm
 
 from physics import recording, tabletop
+from resumable import Resumable
+from resumable_recording import ResumableRecording
 from run import Run
 from stages import run_alone
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import ExpertPolicy
-from worldenv_trl.record import RolloutWriter
 
 
 def demonstrate(run: Run) -> None:
@@ -23,11 +25,17 @@ def demonstrate(run: Run) -> None:
     run.seed_everything("demonstrate")
     count = config.demonstrate.episodes_per_task
     options = {"init_state_mode": "cycle", "terminate_on_success": True, "with_sim_state": True}
-    described = tabletop(config, "train", len(config.tasks), None, **options)
-    about = recording(config, described, "demonstrate")
-    described.close()
-    with RolloutWriter(folder.rollouts("demonstrations"), **about, overwrite=True) as writer:
-        for task in tqdm(config.tasks, desc="demonstrate", unit="task"):
+
+    def about() -> dict[str, Any]:
+        described = tabletop(config, "train", len(config.tasks), None, **options)
+        said = recording(config, described, "demonstrate")
+        described.close()
+        return said
+
+    with ResumableRecording(folder.rollouts("demonstrations"), about) as recorded:
+        left = Resumable(run, "tasks", len(config.tasks), recording=recorded)
+        for number in left.bar("demonstrate", "task"):
+            task = config.tasks[number]
             env = tabletop(config, "train", count, [task], **options)
             collector = GroupCollector(
                 env,
@@ -41,7 +49,7 @@ def demonstrate(run: Run) -> None:
             collector.shutdown()
             solved = (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1)
             check_solved(task, solved)
-            writer.write(rollouts)
+            recorded.writer.write(rollouts)
             folder.log(
                 "demonstrate", task=task, episodes=count, steps=rollouts[keys.MASK].sum(-1).float().mean().item()
             )

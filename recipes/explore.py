@@ -6,16 +6,16 @@ Alone: ``python recipes/explore.py improve --run-dir runs/improve``.
 from __future__ import annotations
 
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
-
-from tqdm import tqdm
 
 from collecting import of_worker
 from physics import chunk_player, exploring_actor, recording, step_env
+from resumable import Resumable
+from resumable_recording import ResumableRecording
 from run import Run
 from stages import run_alone
 from worldenv_trl import keys
-from worldenv_trl.record import RolloutWriter
 
 
 def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
@@ -32,9 +32,9 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
         "seed": run.seed(target, "initial states"),
     }
     env = step_env(config, "train", settings.num_envs, **options)
-    about = recording(config, env, target, {"policy": model}, policy=policy)
-    with RolloutWriter(folder.rollouts(target), **about, overwrite=True) as writer:
-        for factor in settings.scale_factors:
+    about = partial(recording, config, env, target, {"policy": model}, policy=policy)
+    with ResumableRecording(folder.rollouts(target), about) as recorded:
+        for number, factor in enumerate(settings.scale_factors):
             player = chunk_player(exploring_actor(config, model, max(factor, 1e-6)), config.chunk_length)
             collector = run.group_collector(
                 env,
@@ -46,10 +46,16 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
                 total_groups=waves * settings.num_envs,
                 max_decisions=config.max_steps,
             )
-            reached = []
-            for wave in tqdm(collector, total=waves, desc=f"{target} scale x{factor:g}", unit="wave"):
-                rollouts = wave[:, 0]
-                writer.write(rollouts)
+            # The policy stays as it is: its weights, perhaps gigabytes, are in a checkpoint of their own.
+            progress = SimpleNamespace(
+                state_dict=partial(collector.state_dict, weights=False), load_state_dict=collector.load_state_dict
+            )
+            reached: list[float] = []
+            left = Resumable(run, f"scale_{number}", waves, collector=progress, recording=recorded, reached=reached)
+            collected = iter(collector)
+            for _ in left.bar(f"{target} scale x{factor:g}", "wave"):
+                rollouts = next(collected)[:, 0]
+                recorded.writer.write(rollouts)
                 reached.append(
                     (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1).float().mean().item()
                 )

@@ -46,6 +46,24 @@ class NotResumable(ValueError):
     """A checkpoint that is whole but belongs to something else."""
 
 
+class Lost(ValueError):
+    """What a checkpoint continues is no longer as it was."""
+
+
+class Outside:
+    """A component whose content lies in a file of its own, which a checkpoint only continues.
+
+    ``state_dict`` leaves it on the disk and says how far it went; ``load_state_dict`` raises :class:`Lost`, and changes
+    nothing, where that is not there any more. The checkpoint before is taken then.
+    """
+
+    def state_dict(self) -> dict[str, Any]:
+        raise NotImplementedError
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        raise NotImplementedError
+
+
 class Resumable:
     """The numbers of the steps that are left of a loop; see the module.
 
@@ -56,8 +74,9 @@ class Resumable:
         name: of the loop, unique in its stage.
         total: its steps.
         minutes: between two checkpoints; ``checkpoint_minutes`` of the settings when None, 0 saves after every step.
-        components: what the next step depends on. Objects with ``state_dict`` and ``load_state_dict``, or dicts and
-            lists of plain values that are changed in place; those that are None are left out. Random states (torch,
+        components: what the next step depends on. Objects with ``state_dict`` and ``load_state_dict`` (:class:`Outside`
+            where their content is too much for a checkpoint), or dicts and lists of plain values that are changed in
+            place; those that are None are left out. Random states (torch,
             NumPy, Python) and the stage's metrics are always saved. They are restored here, so that what is derived
             from them comes after.
 
@@ -75,6 +94,7 @@ class Resumable:
         self._noted: dict[str, Any] = {}
         self._checkpoint = Checkpoint(format="archive")  # a ZIP file: its checksums tell what is cut short
         everything = components | {"random": _RandomStates(), "noted": self._noted}
+        self._outside = {key for key, component in components.items() if isinstance(component, Outside)}
         for key, component in everything.items():
             if component is not None:
                 if processes.size() > 1 and hasattr(component, "load_state_dict"):
@@ -149,14 +169,27 @@ class Resumable:
             shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink()
         broken, whole = [], None
         for path in sorted(folder.glob(f"{self._rotation.prefix}-{12 * '[0-9]'}.torchrl"), reverse=True):
-            if _is_whole(path):
+            lost = self._lost(path) if _is_whole(path) else f"{path} is cut short or damaged"
+            if lost is None:
                 whole = path
                 break
             broken.append(path)
-            tqdm.write(f"warning: {path} is cut short or damaged: the one before it is taken, if any", file=sys.stderr)
+            tqdm.write(f"warning: {lost}: the one before it is taken, if any", file=sys.stderr)
         for path in broken:  # a later step in its name would keep newer ones from being the newest
             path.unlink()
         return whole
+
+    def _lost(self, path: Path) -> str | None:
+        """What is no longer there of that which a whole checkpoint continues."""
+        there = self._outside & set(Checkpoint.manifest(path)["components"])
+        if not there:
+            return None
+        try:
+            self._checkpoint.load(path, components=there)
+        except CheckpointError as error:
+            if isinstance(error.__cause__, Lost):
+                return f"{error.__cause__}, which {path.name} continues"
+        return None
 
     def _load(self, path: Path) -> None:
         remedy = f"delete {path.parent} to begin the stage anew"
