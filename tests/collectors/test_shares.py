@@ -119,15 +119,32 @@ def test_weights_that_stay_are_stored_once():
     assert len(stored) == 2  # the work and the weights
 
 
-def test_a_collector_continues_from_its_state_and_torchs():
-    collector = spread(Here(), waves=3)
-    collector.next()
+@pytest.mark.parametrize("taken", [1, 2, 3])
+@pytest.mark.parametrize(("before", "after"), [(1, 1), (3, 3), (4, 2), (2, 5)])
+def test_a_collector_continues_from_its_state_and_torchs(taken, before, after):
+    collector = spread(Here(), waves=5, shares=2, waves_at_once=before)
+    for _ in range(taken):
+        collector.next()
     state, random = collector.state_dict(), torch.get_rng_state()
     rest = waves_of(collector)
-    again = spread(Here(), waves=3)
+    again = spread(Here(), waves=5, shares=2, waves_at_once=after)
     again.load_state_dict(state)
     torch.set_rng_state(random)
+    twice = again.state_dict()
+    assert_equal([again.next()], rest[:1])
+    again.load_state_dict(twice)
+    torch.set_rng_state(random)
     assert_equal(waves_of(again), rest)
+
+
+def test_one_process_continues_from_the_starts_of_waves_that_were_ready():
+    collector = spread(Here(), waves=4, waves_at_once=3)
+    collector.next()
+    state = collector.state_dict()
+    rest = waves_of(collector)
+    alone = spread(None, waves=4)
+    alone.load_state_dict(state)
+    assert contexts(waves_of(alone)) == contexts(rest) and len(rest) == 3
 
 
 def test_a_context_sampler_draws_here_and_learns_from_what_comes_back():

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from test_collecting import Alone
 
 from config import GOAL_TASKS, Explore, WorldEnvConfig
 from demonstrate import demonstrate
@@ -22,7 +23,6 @@ from resumable import Resumable
 from run import Run
 from run_folder import RunFolder
 from stages import open_run, rerun
-from test_collecting import Alone
 from worldenv_trl import keys
 from worldenv_trl.record import RolloutWriter, read_rollouts
 
@@ -154,12 +154,10 @@ def test_a_disk_that_is_full_costs_one_line_and_the_wave(run, straight, monkeypa
 
 
 def test_an_exploration_that_finished_begins_anew(run, straight, monkeypatch):
-    writes = []
+    writes, original = [], RolloutWriter.write
+    monkeypatch.setattr(RolloutWriter, "write", lambda self, wave: writes.append(wave) or original(self, wave))
     for _ in range(2):
-        with monkeypatch.context() as patch:
-            original = RolloutWriter.write
-            patch.setattr(RolloutWriter, "write", lambda self, wave: writes.append(wave) or original(self, wave))
-            rerun("explore", explore, run)
+        rerun("explore", explore, run)
     assert len(writes) == 2 * WAVES and result(run, "explore") == straight
 
 
