@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from physics import recording, tabletop
-from resumable import Resumable
+from resumable import Outside, Resumable
 from resumable_recording import ResumableRecording
 from run import Run
 from stages import run_alone
@@ -33,7 +33,7 @@ def demonstrate(run: Run) -> None:
         return said
 
     with ResumableRecording(folder.rollouts("demonstrations"), about) as recorded:
-        left = Resumable(run, "tasks", len(config.tasks), recording=recorded)
+        left = Resumable(run, "tasks", len(config.tasks), recording=Outside(recorded))
         for number in left.bar("demonstrate", "task"):
             task = config.tasks[number]
             env = tabletop(config, "train", count, [task], **options)

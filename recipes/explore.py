@@ -11,7 +11,7 @@ from typing import Any
 
 from collecting import of_worker
 from physics import chunk_player, exploring_actor, recording, step_env
-from resumable import Resumable
+from resumable import Outside, Resumable
 from resumable_recording import ResumableRecording
 from run import Run
 from stages import run_alone
@@ -51,7 +51,9 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
                 state_dict=partial(collector.state_dict, weights=False), load_state_dict=collector.load_state_dict
             )
             reached: list[float] = []
-            left = Resumable(run, f"scale_{number}", waves, collector=progress, recording=recorded, reached=reached)
+            left = Resumable(
+                run, f"scale_{number}", waves, collector=progress, recording=Outside(recorded), reached=reached
+            )
             collected = iter(collector)
             for _ in left.bar(f"{target} scale x{factor:g}", "wave"):
                 rollouts = next(collected)[:, 0]

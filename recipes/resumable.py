@@ -46,22 +46,29 @@ class NotResumable(ValueError):
     """A checkpoint that is whole but belongs to something else."""
 
 
-class Lost(ValueError):
-    """What a checkpoint continues is no longer as it was."""
-
-
 class Outside:
-    """A component whose content lies in a file of its own, which a checkpoint only continues.
+    """A component whose content lies in files of its own, which a checkpoint only continues.
 
-    ``state_dict`` leaves it on the disk and says how far it went; ``load_state_dict`` raises :class:`Lost`, and changes
-    nothing, where that is not there any more. The checkpoint before is taken then.
+    Its ``state_dict`` leaves them on the disk and says how far they go; its ``load_state_dict`` raises ``ValueError``,
+    and changes nothing, where that is not there any more: the checkpoint before is taken then. Of several processes
+    each has files of its own.
     """
 
+    def __init__(self, component: Any) -> None:
+        self._component = component
+
     def state_dict(self) -> dict[str, Any]:
-        raise NotImplementedError
+        return _of_all(self._component.state_dict())
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        raise NotImplementedError
+        try:
+            self._component.load_state_dict(_own(state_dict))
+        except ValueError as error:
+            raise _Lost(str(error)) from error
+
+
+class _Lost(ValueError):
+    """What a checkpoint continues is no longer as it was."""
 
 
 class Resumable:
@@ -187,7 +194,7 @@ class Resumable:
         try:
             self._checkpoint.load(path, components=there)
         except CheckpointError as error:
-            if isinstance(error.__cause__, Lost):
+            if isinstance(error.__cause__, _Lost):
                 return f"{error.__cause__}, which {path.name} continues"
         return None
 
@@ -225,12 +232,21 @@ class _RandomStates:
     """Random states of all processes; each takes up its own."""
 
     def state_dict(self) -> dict[str, Any]:
-        states = processes.gathered_values(GlobalRNGState().state_dict())
-        return states[0] if len(states) == 1 else {f"process_{rank}": state for rank, state in enumerate(states)}
+        return _of_all(GlobalRNGState().state_dict())
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        mine = state_dict if processes.size() == 1 else state_dict[f"process_{processes.rank()}"]
-        GlobalRNGState().load_state_dict(mine)
+        GlobalRNGState().load_state_dict(_own(state_dict))
+
+
+def _of_all(state: dict[str, Any]) -> dict[str, Any]:
+    """The states of all processes, or that of a single one."""
+    states = processes.gathered_values(state)
+    return states[0] if len(states) == 1 else {f"process_{rank}": each for rank, each in enumerate(states)}
+
+
+def _own(states: dict[str, Any]) -> dict[str, Any]:
+    """This process's one of :func:`_of_all`."""
+    return states.get(f"process_{processes.rank()}", states)
 
 
 def _is_whole(path: Path) -> bool:

@@ -7,12 +7,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from resumable import Lost, Outside
 from worldenv_trl.record import RolloutWriter
 
 
-class ResumableRecording(Outside):
-    """Opened at the first write: behind what the checkpoint of the loop says, or anew, over a file of that name.
+class ResumableRecording:
+    """For :class:`resumable.Outside`. Opened at the first write: behind what the checkpoint of the loop says, or anew,
+    over a file of that name.
 
     What was written after the checkpoint is cut off, and written again by the loop: the file ends as one that nothing
     interrupted, byte for byte.
@@ -41,9 +41,9 @@ class ResumableRecording(Outside):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         if not RolloutWriter.still_holds(self.path, state_dict):
-            raise Lost(f"{self.path} is cut short, damaged or gone")
+            raise ValueError(f"{self.path} is cut short, damaged or gone")
         if self._writer is not None:
-            self._writer.__exit__(Lost, None, None)
+            self._writer.__exit__(ValueError)
         self._writer, self._state = None, state_dict
 
     def __enter__(self) -> Self:

@@ -14,6 +14,7 @@ import dataclasses
 import json
 import os
 import shutil
+import tempfile
 import time
 import traceback
 from collections.abc import Iterable, Iterator
@@ -78,6 +79,18 @@ class RunFolder:
         path = self.path / "scratch"
         path.mkdir(parents=True, exist_ok=True)
         return path
+
+    @contextmanager
+    def lasting_scratch(self) -> Iterator[Path]:
+        """Folder for files of this process from which the running stage continues, and with which they go; outside a
+        stage a temporary one."""
+        if self.running is None:
+            with tempfile.TemporaryDirectory(dir=self.scratch) as name:
+                yield Path(name)
+            return
+        path = self.progress(self.running) / f"files_{processes.rank()}"
+        path.mkdir(parents=True, exist_ok=True)
+        yield path
 
     def require_checkpoint(self, name: str, stage: str) -> Path:
         """Path of a checkpoint that ``stage`` writes; raises ``FileNotFoundError`` naming the stage to run."""

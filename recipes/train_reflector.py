@@ -7,7 +7,7 @@ Alone: ``python recipes/train_reflector.py improve --run-dir runs/improve``.
 from __future__ import annotations
 
 import dataclasses
-import tempfile
+from collections.abc import Iterable
 from typing import Any, cast
 
 import torch
@@ -15,11 +15,11 @@ import torch
 import processes
 from data_parallel import DataParallel, WholeOptimizer
 from episodes import demonstrations_and_exploration, split_by_context
-from resumable import Resumable
+from resumable import Outside, Resumable
 from run import LATE, Run, write_rules
 from stages import run_alone
 from worldenv_trl import keys
-from worldenv_trl.data import Episodes, imagine_episodes, score_episodes
+from worldenv_trl.data import Episodes, ImaginedSoFar, imagine_episodes, score_episodes
 from worldenv_trl.metrics import choose_rule, frame_figures, stop_figures
 from worldenv_trl.objectives import ReflectorLoss
 from worldenv_trl.pretrained import Pretrained
@@ -35,12 +35,14 @@ def train_reflector(run: Run, target: str = "reflector", models: str = "", round
     world_model = run.world_model(models)
     share = min(1.0, settings.imagined_share / max(1e-6, 1 - settings.imagined_share))
     chosen = torch.randperm(len(training))[: round(share * len(training))]
-    with tempfile.TemporaryDirectory(dir=run.folder.scratch) as scratch:
+    with run.folder.lasting_scratch() as scratch:
 
         def imagine(episodes: Episodes, name: str) -> Episodes:
+            def batches(count: int, made: ImaginedSoFar) -> Iterable[int]:
+                return Resumable(run, f"imagines {name}", count, made=Outside(made)).bar(label, "batch")
+
             label, folder, seed = f"{target} imagines {name}", f"{scratch}/{name}", run.seed(target, f"imagines {name}")
-            told = label if processes.is_main() else None
-            return imagine_episodes(world_model, episodes, run.kinematics, seed=seed, progress=told, folder=folder)
+            return imagine_episodes(world_model, episodes, run.kinematics, seed=seed, folder=folder, batches=batches)
 
         episodes = [demonstrated, training]
         if len(chosen):

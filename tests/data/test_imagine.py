@@ -179,6 +179,71 @@ def test_a_sink_shows_the_frames_that_it_was_given_and_no_others(tmp_path):
         assert len(sink.frames) == len(frames) and (sink.frames == frames).all()
 
 
+@pytest.mark.parametrize("kept", [0, 1, 3])
+def test_a_sink_goes_on_behind_the_frames_that_its_state_names(tmp_path, kept):
+    frames = make_episodes(LENGTHS).video[0]
+    sink, states, parts = FrameSink(2 * len(frames), tmp_path), [], frames.split(7)
+    states.append(sink.state_dict())
+    for part in parts:
+        sink.add(part)
+        states.append(sink.state_dict())
+    again = FrameSink(2 * len(frames), tmp_path)
+    again.load_state_dict(states[kept])
+    assert not kept or len(again.frames) == 7 * kept
+    for part in (frames + 1).split(7)[kept:]:  # others than were there
+        again.add(part)
+    assert (again.frames == torch.cat([frames[: 7 * kept], (frames + 1)[7 * kept :]])).all()
+    last = FrameSink(2 * len(frames), tmp_path)
+    last.load_state_dict(again.state_dict())
+    assert (last.frames == again.frames).all()
+    if kept < len(parts):
+        with pytest.raises(ValueError, match="are cut short, damaged or gone"):
+            last.load_state_dict(states[-1])  # of frames that were written over
+        assert (last.frames == again.frames).all()
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip", "gone"])
+def test_frames_that_are_no_longer_what_they_were_are_refused(tmp_path, damage):
+    frames = make_episodes(LENGTHS).video[0]
+    sink = FrameSink(len(frames), tmp_path)
+    sink.add(frames)
+    state = sink.state_dict()
+    path = next(tmp_path.rglob("*.memmap"))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.unlink()
+    if damage != "gone":
+        path.write_bytes(data if damage == "flip" else data[:1000])
+    with pytest.raises(ValueError, match="are cut short, damaged or gone"):
+        FrameSink(len(frames), tmp_path).load_state_dict(state)
+
+
+def test_frames_in_memory_cannot_be_continued():
+    with pytest.raises(ValueError, match="go with the process: give the sink a folder"):
+        FrameSink(3).state_dict()
+
+
+def test_imagination_is_continued_with_the_batches_that_are_left(tmp_path):
+    whole, states = imagined(rows_at_once=2), []
+
+    def stopping(count, made):
+        assert count == 3
+        for batch in range(2):
+            yield batch
+            states.append(made.state_dict())
+        raise KeyboardInterrupt
+
+    def continued(count, made):
+        made.load_state_dict(states[0])
+        return range(1, count)
+
+    with pytest.raises(KeyboardInterrupt):
+        imagined(rows_at_once=2, folder=tmp_path, batches=stopping)
+    model = counting()
+    episodes = imagined(model, rows_at_once=2, folder=tmp_path, batches=continued)
+    assert same(episodes, whole) and len(model.requests) == 2 * 3  # batches, chunks of the longest
+
+
 def test_a_full_disk_is_noticed_before_frames_are_written(tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from run_folder import RunFolder
 from stages import open_run, plan, rerun, run_stages
 from world_env import WORKS
 from worldenv_trl import keys
+from worldenv_trl.data import imagine
 from worldenv_trl.record import read_rollouts
 
 SETTINGS = dataclasses.replace(
@@ -96,6 +98,7 @@ def metrics(folder: RunFolder, stage: str) -> list[str]:
         ("sft", "torch.Tensor.backward", 7, "sft: nll continues after step 2 of 3"),
         ("train_world_model", "torch.Tensor.backward", 4, "world_model: steps continues after step 2 of 4"),
         ("train_world_model", "train_world_model.psnr", 1, "world_model: steps was finished"),
+        ("train_reflector", "train_reflector.learn", 1, "reflector: imagines held out was finished"),
         ("train_reflector", "torch.Tensor.backward", 3, "reflector: 0_encoder continues after step 2 of 3"),
         ("train_reflector", "torch.Tensor.backward", 6, "reflector: 1_head continues after step 2 of 3"),
         ("post_train", "post_train.rloo_advantage", 3, "post_train: iterations continues after step 2 of 3"),
@@ -127,6 +130,43 @@ def test_a_stage_continues_to_the_same_weights_and_metrics(
                 assert torch.equal(waves[0][key], waves[1][key])
     left = {path.name for path in run.folder.path.iterdir()} - {path.name for path in straight.iterdir()}
     assert left == set() and not list((run.folder.path / "resume").iterdir())
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_imagined_episodes_continue_batch_by_batch(straight, tmp_path, monkeypatch, capsys, lost):
+    runs = [copy_of(straight, tmp_path / name, checkpoint_minutes=0.0) for name in ("straight", "broken")]
+    painted, paint, most = [], imagine._imagine, [100]
+
+    def painting(*given):
+        if len(painted) == most[0]:
+            raise Interrupted
+        painted.append(given[4].tolist())
+        return paint(*given)
+
+    monkeypatch.setattr(imagine, "_imagine", painting)
+    monkeypatch.setattr("train_reflector.imagine_episodes", partial(imagine.imagine_episodes, rows_at_once=2))
+    rerun("train_reflector", WORKS["train_reflector"], runs[0])
+    whole = painted.copy()
+    assert whole == [[0, 1], [2, 3], [4, 5], [0, 1]]  # for training, and held out
+    painted.clear()
+    for done in (1, 2, 3):
+        most[0] = done
+        with pytest.raises(Interrupted):
+            rerun("train_reflector", WORKS["train_reflector"], runs[1])
+        if lost and done == 2:
+            (frames,) = runs[1].folder.progress("reflector").glob("files_0/training/**/image.memmap")
+            frames.write_bytes(b"")
+        torch.manual_seed(1)
+    most[0] = 100
+    told = (
+        capsys.readouterr().err.replace("\r", "\n").count("are cut short, damaged or gone, which imagines%20training")
+    )
+    assert told == (2 if lost else 0)
+    rerun("train_reflector", WORKS["train_reflector"], runs[1])
+    assert painted == (whole[:2] + whole if lost else whole)
+    results = [files(run.folder.checkpoint("reflector")) for run in runs]
+    assert results[0] == results[1] and metrics(runs[0].folder, "reflector") == metrics(runs[1].folder, "reflector")
+    assert not list((runs[1].folder.path / "resume").iterdir())
 
 
 @pytest.mark.parametrize("contexts", ["uniform", "mixed"])

@@ -3,7 +3,7 @@
 from worldenv_trl.data.episodes import Episodes
 from worldenv_trl.data.from_rollouts import episodes_from_rollouts
 from worldenv_trl.data.hdf5 import hdf5_to_mcap, read_hdf5
-from worldenv_trl.data.imagine import imagine_episodes
+from worldenv_trl.data.imagine import ImaginedSoFar, imagine_episodes
 from worldenv_trl.data.lerobot import write_lerobot
 from worldenv_trl.data.lerobot_reader import read_lerobot
 from worldenv_trl.data.samples import policy_samples
@@ -13,6 +13,7 @@ from worldenv_trl.data.windows import WindowBuffer, WindowSampler, predicted_pos
 
 __all__ = [
     "Episodes",
+    "ImaginedSoFar",
     "WindowBuffer",
     "WindowSampler",
     "episodes_from_rollouts",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterable
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -34,6 +36,7 @@ def imagine_episodes(
     seed: int = 0,
     progress: str | None = None,
     folder: str | os.PathLike | None = None,
+    batches: Callable[[int, ImaginedSoFar], Iterable[int]] | None = None,
 ) -> Episodes:
     """The same actions from the same first frames, imagined open loop on the model's own frames.
 
@@ -54,6 +57,8 @@ def imagine_episodes(
         seed: of the model's noise, for each episode and chunk.
         progress: label of a progress bar; None shows none.
         folder: where the imagined frames go; None keeps them in memory.
+        batches: of how many there are, and of what holds those that are done, gives the numbers of those that are
+            left: for work that is interrupted and continued in the same ``folder``.
 
     Returns:
         Episodes with the model's cameras alone, whose frames are imagined (the first is real) and whose
@@ -72,16 +77,38 @@ def imagine_episodes(
             raise ValueError(f"painted must be the same {len(episodes)} episodes, got {len(painted)}")
         painted.require("the world model", world_model.cameras, world_model.image_size)
     shown = -(-episodes["actions"].shape[1] // world_model.chunk_length) if shown_chunks is None else shown_chunks
-    sink = FrameSink(int((episodes["length"] + 1).sum()), folder)
-    states = []
-    for start in tqdm(range(0, len(episodes), rows_at_once), desc=progress, unit="batch", disable=progress is None):
-        part = slice(start, start + rows_at_once)
+    made = ImaginedSoFar(FrameSink(int((episodes["length"] + 1).sum()), folder))
+    count = -(-len(episodes) // rows_at_once)
+    if batches is None:
+        left: Iterable[int] = tqdm(range(count), desc=progress, unit="batch", disable=progress is None)
+    else:
+        left = batches(count, made)
+    for batch in left:
+        part = slice(batch * rows_at_once, (batch + 1) * rows_at_once)
         known = None if painted is None else painted[part]
-        numbers = torch.arange(start, start + len(episodes[part]))
+        numbers = torch.arange(len(episodes))[part]
         video, predicted = _imagine(world_model, episodes[part], kinematics, seed, numbers, shown, known)
-        sink.add(video[episodes[part].alive])
-        states.append(predicted)
-    return episodes.with_video(sink.frames, kinematic_states=torch.cat(states))
+        made.sink.add(video[episodes[part].alive])
+        made.states.append(predicted)
+    return episodes.with_video(made.sink.frames, kinematic_states=torch.cat(made.states))
+
+
+class ImaginedSoFar:
+    """The frames and the predicted kinematic states [R, T + 1, 20] of the batches that are done.
+
+    Its state names the frames, which stay in the folder of the ``sink``; loading it raises ``ValueError``, and changes
+    nothing, where they are not there any more.
+    """
+
+    def __init__(self, sink: FrameSink) -> None:
+        self.sink, self.states = sink, list[Tensor]()
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"frames": self.sink.state_dict(), "states": torch.cat(self.states) if self.states else None}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.sink.load_state_dict(state_dict["frames"])
+        self.states = [] if state_dict["states"] is None else [state_dict["states"]]
 
 
 def _imagine(

@@ -8,9 +8,11 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -36,13 +38,18 @@ class FrameSink:
 
     Args:
         capacity: most frames.
-        folder: of the memory-mapped files; None keeps them in memory.
+        folder: of the memory-mapped files, which are written over; None keeps them in memory.
     """
 
     def __init__(self, capacity: int, folder: str | os.PathLike | None = None) -> None:
-        storage = LazyTensorStorage(capacity) if folder is None else LazyMemmapStorage(capacity, scratch_dir=folder)
+        disk = folder is not None
+        storage = (
+            LazyMemmapStorage(capacity, scratch_dir=folder, existsok=True) if disk else LazyTensorStorage(capacity)
+        )
         self.buffer = ReplayBuffer(storage=storage, batch_size=1)
         self._capacity, self._folder = capacity, None if folder is None else Path(folder)
+        self._count = self._summed = 0
+        self._sums: dict[str, int] = {}  # checksums of the first `_summed` frames
 
     def add(self, frames: TensorDictBase) -> None:
         """``frames`` [n] behind those that are there.
@@ -51,22 +58,69 @@ class FrameSink:
             ValueError: if they are more than there is room for; none of them is taken.
             OSError: if the disk has no room for as many as there may be; nothing is written.
         """
-        if self._folder is not None and not len(self.buffer) and len(frames):
+        if self._folder is not None and not self._count and len(frames):
             self._folder.mkdir(parents=True, exist_ok=True)
             check_room(self._folder, self._capacity * frames[:1].bytes(), "the frames of the episodes")
-        if len(self.buffer) + len(frames) > self._capacity:  # the buffer would write over its first ones, in silence
+        if self._count + len(frames) > self._capacity:  # the buffer would write over its first ones, in silence
             raise ValueError(
-                f"there is room for {self._capacity} frames, {len(self.buffer)} are there: {len(frames)} do not fit"
+                f"there is room for {self._capacity} frames, {self._count} are there: {len(frames)} do not fit"
             )
         with _without_notices():
             self.buffer.extend(frames)
+        self._count += len(frames)
         if self._folder is not None:
             release(self.frames)
 
     @property
     def frames(self) -> TensorDictBase:
         """All frames [F] so far, not copied."""
-        return self.buffer.storage.get(slice(None))
+        return self.buffer.storage.get(slice(0, self._count))
+
+    def state_dict(self) -> dict[str, Any]:
+        """How many frames there are, and their checksums; they themselves are on the disk by then.
+
+        Raises:
+            ValueError: for frames in memory.
+        """
+        if self._folder is None:
+            raise ValueError("frames in memory go with the process: give the sink a folder")
+        if self._count:
+            self._sums = _summed(self.frames[self._summed :], self._sums)
+            self._summed = self._count
+            self.buffer.storage.dumps(self._folder)
+            release(self.frames)
+            for path in self._folder.rglob("*.memmap"):
+                with path.open("rb+") as file:
+                    os.fsync(file.fileno())
+        return {"count": self._count, "sums": dict(self._sums)}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Goes on behind the frames that were in the folder when :meth:`state_dict` gave this.
+
+        Raises:
+            ValueError: if they are no longer there, bit for bit; nothing is changed then.
+        """
+        if self._folder is None:
+            raise ValueError("frames in memory go with the process: give the sink a folder")
+        count, sums = int(state_dict["count"]), dict(state_dict["sums"])
+        if count:
+            try:
+                frames = TensorDict.load_memmap(self._folder)[:count]
+                found = _summed(frames, {})
+                release(frames)
+            except (OSError, RuntimeError, KeyError, ValueError):
+                found = {}
+            if found != sums:
+                raise ValueError(f"the frames in {self._folder} are cut short, damaged or gone")
+            self.buffer.storage.loads(self._folder)
+        self.buffer.writer.load_state_dict({"_cursor": count})
+        self._count, self._summed, self._sums = count, count, sums
+
+
+def _summed(frames: TensorDictBase, sums: Mapping[str, int]) -> dict[str, int]:
+    """Checksums, by camera, of what has ``sums`` and ``frames`` behind it."""
+    leaves = {"/".join(key): value for key, value in frames.items(True, True)}
+    return {name: zlib.crc32(value.numpy().data, sums.get(name, 0)) for name, value in sorted(leaves.items())}
 
 
 def fill_store(folder: str | os.PathLike, recordings: Sequence[str | os.PathLike]) -> list[Episodes]:
