@@ -7,17 +7,19 @@ Alone: ``python recipes/evaluate.py improve --run-dir runs/improve``.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from outcomes import Judge, outcomes_env, physics_outcomes
 from physics import recording
-from resumable import Resumable
+from resumable import Outside, Resumable
+from resumable_recording import ResumableRecording
 from run import Run
 from run_folder import RunFolder
 from stages import run_alone
 from worldenv_trl.metrics import paired_test, wilson_interval
 from worldenv_trl.policies import laplace_actor
-from worldenv_trl.record import RolloutWriter
 
 
 def evaluate(run: Run, before: str, after: str, models: str | None) -> None:
@@ -31,12 +33,12 @@ def evaluate(run: Run, before: str, after: str, models: str | None) -> None:
     protocols = ("physics",) if reflector is None else ("physics", "reflector")
     pairs = [(protocol, name) for protocol in protocols for name in (before, after)]
     found: list[dict[str, list[bool]]] = []  # of each pair, by task
-    for index in Resumable(run, "policies", len(pairs), minutes=0, found=found):  # a recording is whole or begins anew
+    for index in Resumable(run, "policies", len(pairs), minutes=0, found=found):
         protocol, name = pairs[index]
         success = rolled(run, protocol, name, reflector if protocol == "reflector" else None)
         found.append({task: each.tolist() for task, each in success.items()})
-        if name == after:
-            earlier, later = ({task: torch.tensor(each) for task, each in one.items()} for one in found[-2:])
+        if name == after:  # a checkpoint sorts the tasks by name: both must come in the run's order
+            earlier, later = ({task: torch.tensor(one[task]) for task in run.config.tasks} for one in found[-2:])
             log_protocol(folder, "evaluate", protocol, {before: earlier, after: later})
 
 
@@ -44,25 +46,32 @@ def rolled(run: Run, protocol: str, name: str, judge: Judge | None) -> dict[str,
     """Success bool ``[episodes]`` of a policy in every task; writes its recording."""
     config, policy = run.config, run.policy(name)
     actor = laplace_actor(policy)
-    described = outcomes_env(config, config.tasks[0], "test", judge, 1, with_sim_state=True, proprio=policy.proprio)
-    taking_part = {"policy": policy} | ({} if judge is None else {"reflector": judge.reflector})
-    about = recording(config, described, "evaluate", taking_part, policy=name, protocol=protocol)
-    described.close()
-    with RolloutWriter(run.folder.rollouts(f"evaluate_{protocol}_{name}"), **about, overwrite=True) as writer:
-        return {
-            task: physics_outcomes(
+
+    def about() -> dict[str, Any]:
+        described = outcomes_env(config, config.tasks[0], "test", judge, 1, with_sim_state=True, proprio=policy.proprio)
+        taking_part = {"policy": policy} | ({} if judge is None else {"reflector": judge.reflector})
+        said = recording(config, described, "evaluate", taking_part, policy=name, protocol=protocol)
+        described.close()
+        return said
+
+    success: dict[str, list[bool]] = {}
+    with ResumableRecording(run.folder.rollouts(f"evaluate_{protocol}_{name}"), about) as recorded:
+        parts = {"recording": Outside(recorded), "success": success}
+        for number in Resumable(run, f"{protocol} {name}", len(config.tasks), minutes=0, **parts):
+            task = config.tasks[number]
+            outcomes = physics_outcomes(
                 run,
                 actor,
                 task,
                 "test",
                 config.evaluate.episodes_per_task,
                 judge=judge,
-                writer=writer,
+                writer=recorded.writer,
                 label=f"{name}, {protocol} stops",
                 proprio=policy.proprio,
             )
-            for task in config.tasks
-        }
+            success[task] = outcomes.tolist()
+    return {task: torch.tensor(success[task]) for task in config.tasks}
 
 
 def log_protocol(folder: RunFolder, stage: str, protocol: str, outcomes: dict[str, dict[str, torch.Tensor]]) -> None:

@@ -2,8 +2,8 @@
 
 The same small run, all seven stages, is made twice: once without a break, once by processes that get SIGKILL at random
 moments, the kills being dealt to the stages in turn, and that are started again on the same folder. The weights of
-every part and every figure in ``metrics.jsonl`` but times must be the same, bit for bit. Lost is what a kill undoes:
-the time since the newest checkpoint of its stage, or since the process took up the stage.
+every part, every recorded rollout and every figure in ``metrics.jsonl`` but times must be the same, bit for bit. Lost
+is what a kill undoes: the time since the newest checkpoint of its stage, or since the process took up the stage.
 """
 
 from __future__ import annotations
@@ -20,8 +20,11 @@ import time
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
+import torch
 import tyro
+from tensordict import TensorDict
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -41,6 +44,7 @@ from config import (
 from run_folder import RunFolder
 from stages import open_run, plan, run_stages
 from world_env import WORKS
+from worldenv_trl.record import read_rollouts
 
 _START = multiprocessing.get_context("forkserver")  # imports torch once for all processes
 _START.set_forkserver_preload(["world_env"])
@@ -56,6 +60,8 @@ class Benchmark:
     seed: int = 0
     """Of the moments and of the run."""
     num_threads: int = 1
+    stages: tuple[str, ...] = ()
+    """In which it is killed, for instance ``demonstrate explore reflector``; all of them when empty."""
 
 
 @dataclass(frozen=True)
@@ -73,11 +79,11 @@ def small(path: Path, settings: Benchmark) -> WorldEnvConfig:
         seed=settings.seed,
         num_threads=settings.num_threads,
         checkpoint_minutes=settings.minutes,
-        tasks=GOAL_TASKS[1:2],
+        tasks=GOAL_TASKS[:2],
         train_states=8,
         demonstrate=Demonstrate(episodes_per_task=1),
         sft=SFT(steps=20, scale_steps=10, batch_size=8),
-        explore=Explore(episodes_per_task=8, num_envs=8, scale_factors=(1.0,)),
+        explore=Explore(episodes_per_task=16, num_envs=4, scale_factors=(0.5, 2.0)),
         world_model=WorldModel(steps=10, batch_size=2),
         reflector=Reflector(encoder_steps=8, steps=10, batch_size=4),
         post_train=PostTrain(iterations=3, groups=2, group_size=2, epochs=2, probe_every=2, probe_contexts=2),
@@ -107,8 +113,9 @@ def killed_run(config: WorldEnvConfig, stage_seconds: dict[str, float], settings
     """Kills as many processes as asked for, then lets the last one finish."""
     draw, folder, kills = random.Random(settings.seed), RunFolder(config.run_dir), []
     names = list(stage_seconds)
+    targets = [names.index(name) for name in settings.stages or names]
     while len(kills) < settings.kills:
-        place = len(kills) * len(names) // settings.kills
+        place = targets[len(kills) * len(targets) // settings.kills]
         if folder.done(names[place]):  # nothing would be left to kill of it
             for name in names[place:]:
                 folder.forget(name)
@@ -142,17 +149,33 @@ def _written(folder: RunFolder) -> int:
 
 
 def differences(first: Path, second: Path, stages: list[str]) -> list[str]:
-    """Weights and figures in which two run folders differ."""
+    """Weights, recordings and figures in which two run folders differ."""
     found = []
     for part in sorted(path.relative_to(first) for path in (first / "checkpoints").rglob("*") if path.is_file()):
         other = second / part
         if not other.is_file() or other.read_bytes() != (first / part).read_bytes():
             found.append(str(part))
+    for path in sorted((first / "rollouts").iterdir()):
+        other = second / "rollouts" / path.name
+        if not other.is_file() or not _same(read_rollouts(path), read_rollouts(other)):
+            found.append(str(path.relative_to(first)))
     for stage in stages:
         texts = [[_timeless(line) for line in RunFolder(path).read_metrics(stage)] for path in (first, second)]
         if texts[0] != texts[1]:
             found.append(f"metrics of {stage}")
     return found
+
+
+def _same(first: TensorDict, second: TensorDict) -> bool:
+    """Whether two recordings hold the same entries, bit for bit."""
+    if first.shape != second.shape or set(first.keys(True, True)) != set(second.keys(True, True)):
+        return False
+    pairs = ((first.get(key), second.get(key)) for key in first.keys(True, True))
+    return all(_content(mine) == _content(other) for mine, other in pairs)
+
+
+def _content(value: Any) -> Any:
+    return value.contiguous().numpy().tobytes() if isinstance(value, torch.Tensor) else value.tolist()
 
 
 def _timeless(line: dict) -> str:
@@ -163,6 +186,10 @@ def main(settings: Benchmark) -> None:
     with refusals():
         at_least(0, kills=settings.kills, seed=settings.seed)
         at_least(1, num_threads=settings.num_threads)
+        known = [stage.name for stage in plan(small(Path(), settings))]
+        for name in settings.stages:
+            if name not in known:
+                raise ValueError(f"--stages must be among {', '.join(known)}, got {name!r}")
         if not settings.minutes >= 0:
             raise ValueError(f"--minutes must be at least 0, got {settings.minutes}")
     with tempfile.TemporaryDirectory() as name:
@@ -182,7 +209,10 @@ def main(settings: Benchmark) -> None:
     if lost:
         ends = statistics.median(lost), max(lost), sum(lost) / 60
         print(f"lost: {ends[0]:.1f} s (median), {ends[1]:.1f} s (most), {ends[2]:.2f} minutes in all")
-    print(f"{', '.join(parts)} and all figures: " + ("bit for bit the same" if not found else f"differ in {found}"))
+    print(
+        f"{', '.join(parts)}, all recordings and all figures: "
+        + ("bit for bit the same" if not found else f"differ in {found}")
+    )
     if found:
         raise SystemExit(1)
 

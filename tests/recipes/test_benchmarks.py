@@ -42,6 +42,7 @@ def benchmark(name: str):
         ("expert", {"processes": 0}, "--processes must be at least 1, got 0"),
         ("resume", {"kills": -1}, "--kills must be at least 0, got -1"),
         ("resume", {"minutes": -1.0}, "--minutes must be at least 0, got -1.0"),
+        ("resume", {"stages": ("dream",)}, "--stages must be among demonstrate, sft, explore, .*, got 'dream'"),
         ("throughput", {"device": "gpu"}, "device must be auto, cpu, cuda or cuda:N, got 'gpu'"),
         ("throughput", {"device": "cuda:99"}, "device 'cuda:99' does not exist"),
         ("scale_training", {"device": "gpu"}, "device must be auto, cpu, cuda or cuda:N, got 'gpu'"),

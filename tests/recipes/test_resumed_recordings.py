@@ -17,6 +17,7 @@ from test_collecting import Alone
 
 from config import GOAL_TASKS, Explore, WorldEnvConfig
 from demonstrate import demonstrate
+from evaluate import evaluate
 from explore import explore
 from parts import COMPACT
 from resumable import Resumable
@@ -35,7 +36,7 @@ class Interrupted(Exception):
 
 def settings(tiny: WorldEnvConfig, **changes) -> WorldEnvConfig:
     explored = Explore(episodes_per_task=12, num_envs=4, scale_factors=(0.5, 2.0))
-    config = {"tasks": GOAL_TASKS[1:3], "explore": explored, "checkpoint_minutes": 0.0}
+    config = {"tasks": GOAL_TASKS[:2], "explore": explored, "checkpoint_minutes": 0.0}
     return dataclasses.replace(tiny, **config | changes)
 
 
@@ -53,13 +54,14 @@ def result(run: Run, stage: str) -> tuple[bytes, list[str]]:
     path = run.folder.rollouts({"demonstrate": "demonstrations"}.get(stage, stage))
     left = [each for each in path.parent.iterdir() if each != path]
     assert not left and not run.folder.progress(stage).exists()
-    lines = [
-        json.dumps({name: value for name, value in line.items() if "second" not in name})
-        for line in run.folder.read_metrics(stage)
-    ]
+    lines = list(map(timeless, run.folder.read_metrics(stage)))
     data = path.read_bytes()
     path.unlink()
     return data, lines
+
+
+def timeless(line: dict) -> str:
+    return json.dumps({name: value for name, value in line.items() if "second" not in name})
 
 
 def interrupt(patch: pytest.MonkeyPatch, call: int, method: str = "write", error: BaseException | None = None):
@@ -196,6 +198,30 @@ def test_demonstrations_continue_with_the_next_task(run, monkeypatch, capsys):
     rerun("demonstrate", demonstrate, run)
     assert "demonstrate: tasks continues after step 1 of 2\n" in capsys.readouterr().out
     assert result(run, "demonstrate") == straight
+
+
+def test_an_evaluation_continues_with_the_next_task_of_a_recording(run, monkeypatch, capsys):
+    torch.manual_seed(1)
+    COMPACT.policy.make(run.config).save_pretrained(run.folder.checkpoint("post_train"))
+    assert list(run.config.tasks) != sorted(run.config.tasks)
+
+    def evaluated() -> tuple[list[bytes], list[str]]:
+        with run.folder.stage("evaluate"):
+            evaluate(run, "sft", "post_train", None)
+        names = [f"evaluate_physics_{name}.mcap" for name in ("post_train", "sft")]
+        assert sorted(each.name for each in run.folder.rollouts("").parent.iterdir()) == names
+        data = [(run.folder.rollouts("").parent / name).read_bytes() for name in names]
+        return data, list(map(timeless, run.folder.read_metrics("evaluate")))
+
+    straight = evaluated()
+    for _ in range(3):  # a task each, of two policies
+        with monkeypatch.context() as patch:
+            interrupt(patch, 2)
+            with pytest.raises(Interrupted):
+                evaluated()
+    assert "evaluate: physics post_train continues after step 1 of 2\n" not in capsys.readouterr().out
+    assert evaluated() == straight
+    assert "evaluate: physics post_train continues after step 1 of 2\n" in capsys.readouterr().out
 
 
 def work(config: WorldEnvConfig) -> None:
