@@ -132,6 +132,8 @@ def killed_run(config: WorldEnvConfig, stage_seconds: dict[str, float], settings
         process.kill()
         at = time.time()
         process.join()
+        if process.exitcode == 0:
+            continue  # it was over in that very moment
         if process.exitcode != -signal.SIGKILL:
             raise RuntimeError(f"the process that should be killed ended by itself, with code {process.exitcode}")
         stage = next((name for name in names if not folder.done(name)), names[-1])

@@ -230,6 +230,16 @@ def test_a_saved_collector_resumes_where_it_was():
     assert len(list(second)) == 2
 
 
+def test_a_state_without_weights_leaves_those_of_the_policy_alone():
+    first, second = make_collector(total_groups=6), make_collector(total_groups=6)
+    first.next()
+    before = second.policy.module.linear.weight.clone()
+    state = first.state_dict(weights=False)
+    assert "policy_state_dict" not in state
+    second.load_state_dict(state)
+    assert torch.equal(second.policy.module.linear.weight, before) and len(list(second)) == 2
+
+
 def test_a_seed_fixes_env_and_samples():
     batches = []
     for _ in range(2):

@@ -127,7 +127,11 @@ def test_loop_in_the_physics_is_lived_by_one_and_learned_by_both(one, two, tmp_p
 
 @pytest.mark.parametrize(
     ("kind", "update", "said"),
-    [("post_train", 22, "iterations continues after step"), ("sft", 22, "nll continues after step 1 of 5")],
+    [
+        ("post_train", 22, "iterations continues after step"),
+        ("sft", 22, "nll continues after step 1 of 5"),
+        ("train_reflector", 4, "imagines held out was finished"),
+    ],
 )
 @pytest.mark.parametrize("two", ["ddp"], indirect=True)
 def test_two_processes_of_which_one_is_killed_continue_to_the_same_weights(one, two, tmp_path, kind, update, said):
