@@ -29,7 +29,7 @@ def evaluate(run: Run, before: str, after: str, models: str | None) -> None:
     """
     folder = run.folder
     run.seed_everything("evaluate")
-    reflector = None if models is None else Judge(run.reflector(models), run.rules(models)["real"])
+    reflector = None if models is None else Judge(run.reflector(models).for_world("real"), run.rules(models)["real"])
     protocols = ("physics",) if reflector is None else ("physics", "reflector")
     pairs = [(protocol, name) for protocol in protocols for name in (before, after)]
     found: list[dict[str, list[bool]]] = []  # of each pair, by task

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from direct_predictor import fit_direct, predict_direct
 from real_groups import RealGroups
 from run import LATE
 from worldenv_trl.data import Episodes, imagine_episodes, score_episodes
@@ -32,7 +31,7 @@ from worldenv_trl.metrics import (
 from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.world_models import WorldModel
 
-REAL, AHEAD, IMAGINED, DIRECT = "real frames", "one chunk ahead", "imagined", "no video"
+REAL, AHEAD, IMAGINED = "real frames", "one chunk ahead", "imagined"
 
 
 @dataclass(frozen=True)
@@ -90,8 +89,8 @@ FIGURES: dict[str, tuple[Callable[[Tensor, Tensor], Tensor], str, str]] = {
 
 def view(judge: RuledReflector, groups: RealGroups, episodes: Episodes, real: bool = False) -> View:
     """What is said of ``episodes``, the groups' own (``real``) or what was imagined of them."""
-    scores, alive = score_episodes(judge.reflector, episodes), episodes.alive
     world = "real" if real else "imagined"
+    scores, alive = score_episodes(judge.reflector.for_world(world), episodes), episodes.alive
     stop = judge.rules[world].first(scores, alive)
     stopped, done = judged(stop, groups.reached, LATE[world])
     return View(
@@ -126,10 +125,15 @@ def mean_correlation(correlations: Tensor, task_id: Tensor, rows: Tensor, resamp
 
 def views(
     judge: RuledReflector, world_model: WorldModel, kinematics: ForwardKinematics, groups: RealGroups
-) -> tuple[dict[str, View], Episodes]:
+) -> tuple[dict[str, View], Episodes | None]:
     """:data:`REAL`: what the reflector can tell; :data:`AHEAD`: every chunk imagined from real memory; and
-    :data:`IMAGINED`: open loop. Also the episodes one chunk ahead [G * N], for :func:`curve`."""
+    :data:`IMAGINED`: open loop. Also the episodes one chunk ahead [G * N], for :func:`curve`.
+
+    Where imagination's judge looks at no video, nothing is imagined: there are :data:`REAL` and :data:`IMAGINED` alone.
+    """
     episodes = groups.episodes
+    if not judge.reflector.for_world("imagined").reads_video:
+        return {REAL: view(judge, groups, episodes, real=True), IMAGINED: view(judge, groups, episodes)}, None
     ahead = imagine_episodes(world_model, episodes, kinematics, shown_chunks=None, progress=AHEAD)
     imagined = imagine_episodes(world_model, episodes, kinematics, painted=ahead, progress=IMAGINED)
     return {
@@ -137,15 +141,6 @@ def views(
         AHEAD: view(judge, groups, ahead),
         IMAGINED: view(judge, groups, imagined),
     }, ahead
-
-
-def direct_view(explored: Episodes, kinematics: ForwardKinematics, groups: RealGroups, tasks: int) -> View:
-    """What a predictor of success says that is trained on ``explored`` and sees no video; stopped is above one half."""
-    seen_by = groups.episodes.cameras
-    predictor = fit_direct(explored.through(seen_by), kinematics, tasks)
-    prob = groups.grouped(predict_direct(predictor, groups.episodes, kinematics))
-    end = groups.grouped(groups.episodes["length"].squeeze(-1))
-    return View(returns=prob, largest=prob, end=end, stopped=prob > 0.5, done=groups.success, success=groups.success)
 
 
 def curve(
@@ -171,7 +166,7 @@ def curve(
             imagined = imagine_episodes(
                 world_model, groups.episodes[rows], kinematics, shown_chunks=shown, painted=painted[rows]
             )
-            scores, alive = score_episodes(judge.reflector, imagined), imagined.alive
+            scores, alive = score_episodes(judge.reflector.for_world("imagined"), imagined), imagined.alive
             stop = judge.rules["imagined"].first(scores, alive)
             returns[rows] = loop_returns(scores, stop, alive)
         out[shown] = group_correlations(groups.grouped(returns), groups.success)

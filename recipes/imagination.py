@@ -39,7 +39,7 @@ class Imagination:
         world_model = run.world_model(suffix)
         contexts = read_contexts(run, world_model.cameras, rounds=int(suffix.removeprefix("_") or 1))
         rule = run.rules(suffix)["imagined"]
-        return cls(world_model, run.reflector(suffix), rule, to_device(contexts, run.device))
+        return cls(world_model, run.reflector(suffix).for_world("imagined"), rule, to_device(contexts, run.device))
 
     def env(
         self,

@@ -13,7 +13,17 @@ from config import WorldEnvConfig
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.language import split_words
 from worldenv_trl.policies import OFTConfig, OFTPolicy, Policy
-from worldenv_trl.reflectors import CompactLessons, CompactReflector, CompactReflectorConfig, Reflector
+from worldenv_trl.pretrained import OtherClassError
+from worldenv_trl.reflectors import (
+    CompactLessons,
+    CompactReflector,
+    CompactReflectorConfig,
+    DualReflector,
+    DualReflectorConfig,
+    PathLessons,
+    PathReflectorConfig,
+    Reflector,
+)
 from worldenv_trl.scenes import load_task
 from worldenv_trl.vision import load_vision
 from worldenv_trl.world_models import VideoWorldModel, VideoWorldModelConfig, WorldModel
@@ -86,29 +96,46 @@ def make_world_model(config: WorldEnvConfig) -> VideoWorldModel:
     )
 
 
-def make_reflector(config: WorldEnvConfig) -> CompactReflector:
+def make_reflector(config: WorldEnvConfig) -> CompactReflector | DualReflector:
     settings = config.reflector
-    reflector = CompactReflector(
-        CompactReflectorConfig(
-            instructions=instructions(config),
-            cameras=config.cameras,
-            image_size=config.image_size,
-            vision_blocks=settings.vision_blocks,
-        ),
-        lessons=CompactLessons(
-            encoder_steps=settings.encoder_steps,
-            steps=settings.steps,
-            batch_size=settings.batch_size,
-            lr=settings.lr,
-        ),
+    video = CompactReflectorConfig(
+        instructions=instructions(config),
+        cameras=config.cameras,
+        image_size=config.image_size,
+        vision_blocks=settings.vision_blocks,
     )
+    lessons = CompactLessons(
+        encoder_steps=settings.encoder_steps,
+        steps=settings.steps,
+        batch_size=settings.batch_size,
+        lr=settings.lr,
+    )
+    reflector: CompactReflector | DualReflector = CompactReflector(video, lessons)
+    if settings.path_steps:
+        tasks = [load_task(task) for task in config.tasks]
+        fixed = [name for name in config.cameras if all(task.camera(name).mount == "world" for task in tasks)]
+        cameras = {name: {task.language: task.camera(name) for task in tasks} for name in fixed}
+        path = PathReflectorConfig.for_cameras(cameras, image_size=config.image_size)
+        reflector = DualReflector(
+            DualReflectorConfig(video, path), lessons, PathLessons(steps=settings.path_steps, lr=settings.lr)
+        )
     if settings.vision_blocks:
         load_vision(reflector, config.vision_weights)
     return reflector
 
 
+def load_reflector(path: Path) -> CompactReflector | DualReflector:
+    try:
+        return CompactReflector.from_pretrained(path)
+    except OtherClassError as error:
+        try:
+            return DualReflector.from_pretrained(path)
+        except OtherClassError:
+            raise error from None
+
+
 COMPACT = Parts(
     policy=Part(make_policy, OFTPolicy.from_pretrained),
     world_model=Part(make_world_model, VideoWorldModel.from_pretrained),
-    reflector=Part(make_reflector, CompactReflector.from_pretrained),
+    reflector=Part(make_reflector, load_reflector),
 )

@@ -1,6 +1,7 @@
 """The instant reflector: trained on real and imagined rollouts, and the rules by which it stops them.
 
-Imagined rollouts are replays of recorded actions in the world model, labelled by what the physics did under them.
+Imagined rollouts are replays of recorded actions in the world model, labelled by what the physics did under them; who
+looks at no video in imagination needs none.
 Alone: ``python recipes/train_reflector.py improve --run-dir runs/improve``.
 """
 
@@ -44,17 +45,15 @@ def train_reflector(run: Run, target: str = "reflector", models: str = "", round
             label, folder, seed = f"{target} imagines {name}", f"{scratch}/{name}", run.seed(target, f"imagines {name}")
             return imagine_episodes(world_model, episodes, run.kinematics, seed=seed, folder=folder, batches=batches)
 
-        episodes = [demonstrated, training]
-        if len(chosen):
-            episodes.append(imagine(training[chosen], "training"))
-        imagined_held_out = imagine(held_out, "held out")
         reflector = run.parts.reflector.make(config).to(run.device)
+        episodes, shown = [demonstrated, training], {"real": held_out, "imagined": held_out}
+        if reflector.for_world("imagined").reads_video:
+            if len(chosen):
+                episodes.append(imagine(training[chosen], "training"))
+            shown["imagined"] = imagine(held_out, "held out")
         learn(run, reflector, Episodes.cat([part.through(world_model.cameras) for part in episodes]), target)
         reflector.eval()
-        scores = {
-            "real": score_episodes(reflector, held_out),
-            "imagined": score_episodes(reflector, imagined_held_out),
-        }
+        scores = {world: score_episodes(reflector.for_world(world), each) for world, each in shown.items()}
     rules = dict.fromkeys(scores, StopRule(settings.threshold, settings.consecutive))
     if settings.choose_threshold:  # on training contexts that no part of the reflector has seen
         number = held_out[keys.TASK_ID].squeeze(-1)

@@ -75,7 +75,10 @@ def imagine(
 ) -> TwoWorlds:
     """The actions of physical ``episodes`` in imagination, and the reflector's view of both."""
     imagined = imagine_episodes(world_model, episodes, run.kinematics)
-    scores = {"real": score_episodes(reflector, episodes), "imagined": score_episodes(reflector, imagined)}
+    scores = {
+        world: score_episodes(reflector.for_world(world), shown)
+        for world, shown in (("real", episodes), ("imagined", imagined))
+    }
     stops = {name: rules[name].first(values, episodes.alive) for name, values in scores.items()}
     return TwoWorlds(episodes, imagined, scores["real"], scores["imagined"], stops["real"], stops["imagined"])
 

@@ -14,9 +14,8 @@ bootstrap over groups:
 - ECE (expected calibration error, ten bins) and slope of the return against the goal being reached by the end.
 
 Rows: the reflector on the real frames (its ceiling); one chunk ahead (real frames as memory at the start of every
-chunk); imagination; with ``--direct`` a predictor from first frames, task and the hand's path, trained on the run's
-exploration: what needs no video. The last table is r when real frames are shown to the first chunks only: when the
-truth is lost.
+chunk); imagination. The last table is r when real frames are shown to the first chunks only: when the truth is lost. A
+judge that looks at no video (``reflector.path_steps``) has no need of either: "imagined" is then what it says.
 """
 
 from __future__ import annotations
@@ -36,16 +35,13 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from command_line import at_least, refusals
-from episodes import demonstrations_and_exploration
 from gather_evidence import read_config
 from group_views import (
     AHEAD,
-    DIRECT,
     FIGURES,
     IMAGINED,
     RuledReflector,
     curve,
-    direct_view,
     figures,
     mean_correlation,
     views,
@@ -53,9 +49,7 @@ from group_views import (
 from real_groups import Draw, RealGroups, check_draw, real_groups
 from run import Run, read_rules
 from run_folder import RunFolder
-from seeds import stage_seed
 from threads import use_threads
-from worldenv_trl.data import Episodes
 from worldenv_trl.metrics import Estimate
 from worldenv_trl.record.mcap.provenance import model_hash
 from worldenv_trl.report import RunRecord
@@ -89,8 +83,6 @@ class Settings:
     to another imagination of the mixed groups."""
     against: Path | None = None
     """JSON that other models left for the same groups: the difference of r, group by group, is shown, too."""
-    direct: bool = False
-    """Also train the predictor that sees no video (a minute or two)."""
     resamples: int = 1000
     """Of the bootstrap."""
     out: Path | None = None
@@ -98,8 +90,7 @@ class Settings:
     hashes where they are not the run's."""
     num_threads: int = 1
     device: str = "auto"
-    """Of the models: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one. The predictor that sees no
-    video stays on the CPU."""
+    """Of the models: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one."""
 
 
 def main(settings: Settings) -> Path:
@@ -121,7 +112,6 @@ def main(settings: Settings) -> Path:
         world_model = run.parts.world_model.load(paths["world_model"]).eval().to(run.device)
         reflector = run.parts.reflector.load(paths["reflector"]).eval().to(run.device)
         judge = RuledReflector(reflector, read_rules(paths["reflector"]))
-        explored = demonstrations_and_exploration(run, 1)[1] if settings.direct else None
         before = None if settings.against is None else read_report(settings.against)
         folder = settings.groups or settings.run / "signal" / paths["policy"].name
         models = {"policy": policy, "world_model": world_model, "reflector": judge.reflector}
@@ -137,7 +127,7 @@ def main(settings: Settings) -> Path:
         }
         if before is not None:
             _check_comparable(report, before, settings.against)
-    report |= measure(run, groups, world_model, judge, settings, explored, before)
+    report |= measure(run, groups, world_model, judge, settings, before)
     names = [
         path.name if path.parent == run.folder.path / "checkpoints" else f"{path.name}_{hashes[name][:8]}"
         for name, path in paths.items()
@@ -191,23 +181,20 @@ def measure(
     world_model: WorldModel,
     judge: RuledReflector,
     settings: Settings,
-    explored: Episodes | None = None,
     before: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """All figures as plain values, by view, task and name: ``[value, low, high]``, None where one cannot be said.
 
-    ``explored``: what the predictor without video learns from; ``before``: a report of the same groups to compare with.
+    ``before``: a report of the same groups to compare with.
     """
     started = time.monotonic()
     seen, ahead = views(judge, world_model, run.kinematics, groups)
     chunks = math.ceil(groups.episodes["actions"].shape[1] / world_model.chunk_length)
     between = tuple(sorted({shown for shown in settings.shown_chunks if shown < chunks}))
     shown_to = {1: seen[IMAGINED].correlations}
-    shown_to |= curve(judge, world_model, run.kinematics, groups, (seen[AHEAD], ahead), between)
-    shown_to[chunks] = seen[AHEAD].correlations
-    if explored is not None:
-        torch.manual_seed(stage_seed(settings.seed, "direct_predictor"))
-        seen[DIRECT] = direct_view(explored, run.kinematics, groups, len(run.config.tasks))
+    if ahead is not None:
+        shown_to |= curve(judge, world_model, run.kinematics, groups, (seen[AHEAD], ahead), between)
+        shown_to[chunks] = seen[AHEAD].correlations
     numbers, kinds = groups.task_id, {"all": torch.ones_like(groups.task_id, dtype=torch.bool)}
     kinds |= {task: numbers == place for place, task in enumerate(run.config.tasks)}
 

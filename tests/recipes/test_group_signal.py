@@ -5,15 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-from functools import partial
 
 import pytest
 import torch
 from tensordict import TensorDict
 from test_benchmarks import benchmark
 
-from direct_predictor import fit_direct
-from group_views import AHEAD, DIRECT, FIGURES, IMAGINED, REAL, RuledReflector, curve, views
+from group_views import AHEAD, FIGURES, IMAGINED, REAL, RuledReflector, curve, views
 from parts import make_policy, make_reflector, make_world_model
 from real_groups import Draw, RealGroups, real_groups
 from run import Run, write_rules
@@ -118,15 +116,18 @@ def test_the_command_leaves_its_figures(run, capsys):
     assert set(json.loads(again.read_text())["gain"]) == {"all", *run.config.tasks}
 
 
-def test_what_needs_no_video_learns_from_the_exploration(run, monkeypatch):
-    with pytest.raises(SystemExit, match=r"demonstrations.mcap does not exist: run the stage 'demonstrate'"):
-        command(run, direct=True)
-    command(run)
-    for name in ("demonstrations", "explore"):
-        shutil.copy(run.folder.path / "signal" / "sft" / "groups.mcap", run.folder.rollouts(name))
-    monkeypatch.setattr("group_views.fit_direct", partial(fit_direct, steps=2))
-    views = json.loads(command(run, direct=True).read_text())["views"]
-    assert list(views) == [REAL, AHEAD, IMAGINED, DIRECT]
+def test_nothing_is_imagined_for_a_judge_that_looks_at_no_video(run, monkeypatch):
+    by_path = dataclasses.replace(run.config.reflector, path_steps=1)
+    shutil.rmtree(run.folder.checkpoint("reflector"))
+    make_reflector(dataclasses.replace(run.config, reflector=by_path)).save_pretrained(
+        run.folder.checkpoint("reflector")
+    )
+    write_rules(run.folder.checkpoint("reflector"), {"real": StopRule(), "imagined": StopRule()})
+    monkeypatch.delattr("group_views.imagine_episodes")
+    report = json.loads(command(run).read_text())
+    assert list(report["views"]) == [REAL, IMAGINED] and list(report["curve"]["all"]) == ["1"]
+    errors = {name: each["all"]["calibration_error"] for name, each in report["views"].items()}
+    assert errors[REAL] != errors[IMAGINED]
 
 
 @pytest.mark.parametrize(

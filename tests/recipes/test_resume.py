@@ -21,6 +21,7 @@ from world_env import WORKS
 from worldenv_trl import keys
 from worldenv_trl.data import imagine
 from worldenv_trl.record import read_rollouts
+from worldenv_trl.reflectors import PathReflector
 
 SETTINGS = dataclasses.replace(
     config.PRESETS["smoke"][1],
@@ -204,3 +205,27 @@ def test_an_earlier_stage_that_runs_again_takes_the_checkpoints_of_the_later_one
     assert list(run.folder.progress("post_train").iterdir())
     rerun("sft", WORKS["sft"], run)
     assert not run.folder.progress("post_train").exists()
+
+
+def test_a_judge_of_paths_learns_without_imagined_episodes_continues_and_rewards_imagination(
+    straight, tmp_path, monkeypatch, capsys
+):
+    judged = dataclasses.replace(SETTINGS.reflector, path_steps=3)
+    runs = [copy_of(straight, tmp_path / name, reflector=judged) for name in ("straight", "broken")]
+    monkeypatch.delattr("train_reflector.imagine_episodes")
+    rerun("train_reflector", WORKS["train_reflector"], runs[0])
+    with monkeypatch.context() as patch:
+        patch.setattr(Resumable, "_due", lambda self: self.step % 2 == 0)
+        break_at(patch, "torch.Tensor.backward", 9)
+        with pytest.raises(Interrupted):
+            rerun("train_reflector", WORKS["train_reflector"], runs[1])
+    torch.manual_seed(1)
+    rerun("train_reflector", WORKS["train_reflector"], runs[1])
+    assert "reflector: 2_paths continues after step 2 of 3\n" in capsys.readouterr().out
+    weights = [files(run.folder.checkpoint("reflector")) for run in runs]
+    assert weights[0] == weights[1]
+    rewards, judge = [], PathReflector.extend
+    monkeypatch.setattr(PathReflector, "extend", lambda *given: rewards.append(out := judge(*given)) or out)
+    rerun("post_train", WORKS["post_train"], runs[0])
+    assert rewards
+    assert files(runs[0].folder.checkpoint("post_train")) != files(straight / "checkpoints" / "post_train")

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from worldenv_trl.data.episodes import Episodes
 from worldenv_trl.devices import device_of
+from worldenv_trl.keys import KINEMATIC_STATES
 from worldenv_trl.reflectors import Reflector
 
 __all__ = ["score_episodes"]
@@ -29,7 +30,10 @@ def score_episodes(reflector: Reflector, episodes: Episodes, *, rows_at_once: in
     device, parts = device_of(reflector), []
 
     def shown(rows: Tensor, steps: Tensor) -> dict[str, Tensor]:
-        return {camera: episodes.frames(camera, rows, steps).to(device) for camera in reflector.cameras}
+        frames = {camera: episodes.frames(camera, rows, steps).to(device) for camera in reflector.cameras}
+        if reflector.reads_path:
+            frames[KINEMATIC_STATES] = episodes["kinematic_states"][rows, steps].to(device)
+        return frames
 
     for start in range(0, len(episodes), rows_at_once):
         rows = torch.arange(start, min(start + rows_at_once, len(episodes)))

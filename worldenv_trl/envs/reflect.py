@@ -65,7 +65,8 @@ class Reflect(Transform):
     """
 
     def __init__(self, reflector: Reflector, rule: StopRule = StopRule()) -> None:  # noqa: B008 - frozen
-        super().__init__(in_keys=[*(image_key(camera) for camera in reflector.cameras), INSTRUCTION])
+        path = [KINEMATIC_STATE] if reflector.reads_path else []
+        super().__init__(in_keys=[*(image_key(camera) for camera in reflector.cameras), *path, INSTRUCTION])
         self.out_keys = [SUCCESS_PROB]
         self.reflector = reflector.eval().requires_grad_(False)
         # TorchRL steps chunks through shallow copies of this transform: all must remember the same rollouts and rule.
@@ -97,6 +98,8 @@ class Reflect(Transform):
         batch, memory = self.parent.batch_size, self._memory
         mask = None if tensordict is None else tensordict.get("_reset", None)
         images = {camera: _by_row(tensordict_reset, image_key(camera)) for camera in self.reflector.cameras}
+        if self.reflector.reads_path:
+            images[KINEMATIC_STATES] = _by_row(tensordict_reset, KINEMATIC_STATE)
         count, device = batch.numel(), next(iter(images.values())).device
         if "prob" not in memory or len(memory["prob"]) != count:
             mask = None  # rows without a video cannot be left out
@@ -146,12 +149,17 @@ class Reflect(Transform):
         return next_tensordict
 
     def _frames(self, shown: TensorDictBase, rows: Tensor, chunk: bool) -> dict[str, Tensor]:
-        """The new frames of ``rows``, uint8 [n, C, 3, H, W] by camera."""
+        """What the reflector reads of the new frames of ``rows``: uint8 [n, C, 3, H, W] by camera, and the path."""
+        keys: dict[str, tuple[Any, Any]] = {
+            camera: (frames_key(camera), image_key(camera)) for camera in self.reflector.cameras
+        }
+        if self.reflector.reads_path:
+            keys[KINEMATIC_STATES] = (KINEMATIC_STATES, KINEMATIC_STATE)
         frames = {}
-        for camera in self.reflector.cameras:
-            video = _by_row(shown, frames_key(camera)) if chunk else _by_row(shown, image_key(camera)).unsqueeze(1)
+        for name, (several, one) in keys.items():
+            video = _by_row(shown, several) if chunk else _by_row(shown, one).unsqueeze(1)
             video = video if len(rows) == len(video) else video[rows]
-            frames[camera] = video.to(device_of(self.reflector, video.device))
+            frames[name] = video.to(device_of(self.reflector, video.device))
         return frames
 
     def _judge(self, rows: Tensor, frames: dict[str, Tensor], executed: Tensor) -> tuple[Tensor, Tensor]:

@@ -121,7 +121,8 @@ class ForwardKinematics(nn.Module):
         pose = torch.cat([tcp[:, :3, 3], tcp[:, :3, :3].flatten(1), flat[:, 19:]], -1)
         return pose.reshape(*kinematic_state.shape[:-1], 13)
 
-    def commanded_pose(self, kinematic_state: Tensor) -> Tensor:
+    @staticmethod
+    def commanded_pose(kinematic_state: Tensor) -> Tensor:
         """The accumulated target [*B, 13]: x_des, R_des, commanded opening."""
         return kinematic_state[..., 7:20]
 

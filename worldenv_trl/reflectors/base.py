@@ -49,6 +49,11 @@ class Reflector(nn.Module, abc.ABC):
         image_size: height and width of the frames (px), None for any.
         instructions: those it is trained on. One that has some calls ``self.seen.check(instructions)`` in
             :meth:`begin`, which warns of others.
+        reads_path: whether it also reads where the hand goes. ``frames`` then have the entry ``kinematic_states``
+            beside the cameras, float32 [n, 20] of the first frame and [n, C, 20] of the next ones: commanded, so the
+            same in physics and imagination.
+        reads_video: whether it looks at more than the first frame. One that does not says the same of a rollout and of
+            what a world model imagines of its actions.
 
     Raises:
         ValueError: for no camera, or one that is named twice.
@@ -77,11 +82,14 @@ class Reflector(nn.Module, abc.ABC):
         cameras: Sequence[str] = ("agentview",),
         image_size: int | None = None,
         instructions: Sequence[str] = (),
+        reads_path: bool = False,
+        reads_video: bool = True,
     ) -> None:
         super().__init__()
         if not cameras or len(set(cameras)) < len(cameras):
             raise ValueError(f"cameras must name at least one camera, each once, got {tuple(cameras)}")
         self.cameras, self.image_size = tuple(cameras), image_size
+        self.reads_path, self.reads_video = reads_path, reads_video
         self.seen = SeenInstructions(f"the reflector {type(self).__name__}", instructions)
 
     @property
@@ -94,7 +102,7 @@ class Reflector(nn.Module, abc.ABC):
         """The state [n] of n videos of which only the first frame is known.
 
         Args:
-            frames: uint8 [n, 3, H, W] by camera.
+            frames: uint8 [n, 3, H, W] by camera, and ``kinematic_states`` where it ``reads_path``.
             instructions: n texts.
 
         Returns:
@@ -110,6 +118,10 @@ class Reflector(nn.Module, abc.ABC):
         The scores of a video are the same in whatever pieces its frames come. ``state`` itself is not changed; the new
         one has the same entries.
         """
+
+    def for_world(self, world: str) -> Reflector:
+        """Who judges rollouts of a ``world``, ``real`` or ``imagined``: itself, unless it has others for that."""
+        return self
 
     def train_on(self, episodes: Episodes) -> Iterator[Lesson]:
         """The lessons to train on labelled ``episodes``, one after the other; none for a reflector that is not trained.

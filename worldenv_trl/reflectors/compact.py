@@ -16,6 +16,7 @@ from worldenv_trl.language import Vocabulary
 from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.reflectors.base import Lesson, Reflector
 from worldenv_trl.reflectors.compact_lessons import CompactLessons, lessons_of
+from worldenv_trl.reflectors.goal import MAX_WORDS, Goal
 from worldenv_trl.reflectors.prefixes import prefix_indices
 from worldenv_trl.vision import PretrainedEncoder
 
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 __all__ = ["CompactReflector", "CompactReflectorConfig"]
 
 _FRAMES_PER_CALL = 64
-_MAX_WORDS = 64
 _DEFAULT_LESSONS = CompactLessons()
 
 
@@ -92,12 +92,12 @@ class CompactReflector(Reflector, Pretrained):
     def __init__(self, config: CompactReflectorConfig, lessons: CompactLessons = _DEFAULT_LESSONS) -> None:
         super().__init__(cameras=config.cameras, image_size=config.image_size, instructions=config.instructions)
         self.config, self.lessons = config, lessons
-        self.vocabulary = Vocabulary(Vocabulary.of(config.instructions), _MAX_WORDS)
+        self.vocabulary = Vocabulary(Vocabulary.of(config.instructions), MAX_WORDS)
         words, dim, hidden = len(self.vocabulary.words), config.feature_dim, config.hidden_dim
         self.encoder = _Encoder(config)
         self.frame_hidden = nn.Sequential(nn.Linear(2 * dim, hidden), nn.GELU())
-        self.frame_goal = _Goal(words, dim, hidden + 1, scale=(3 * hidden) ** -0.5)
-        self.query = _Goal(words, dim, dim, scale=1.0)
+        self.frame_goal = Goal(words, dim, hidden + 1, scale=(3 * hidden) ** -0.5)
+        self.query = Goal(words, dim, dim, scale=1.0)
         self.key = nn.Linear(dim, dim, bias=False)  # a bias would add the same to all frames of a prefix
         self.age = nn.Parameter(torch.zeros(config.num_frames))
         self.head = nn.Sequential(nn.LayerNorm(6 * dim), nn.Linear(6 * dim, hidden), nn.GELU(), nn.Linear(hidden, 1))
@@ -278,28 +278,6 @@ class _Encoder(nn.Module):
                 maps = [each_map.flatten(1) for each_map in self.vision(image)]
                 each[index] = each[index] + read(torch.cat(maps, 1))
         return self.together(torch.cat(each, -1))
-
-
-class _Goal(nn.Module):
-    """A vector [n, size] for instructions, int64 [n, L]: linear in the mean of their words, each marked by its place.
-
-    Without the places "the left bowl on the right bowl" would be the same goal as "the right bowl on the left bowl". An
-    unknown word says nothing.
-    """
-
-    def __init__(self, num_words: int, dim: int, size: int, scale: float) -> None:
-        super().__init__()
-        self.words = nn.Embedding(num_words, dim, padding_idx=0)
-        self.places = nn.Parameter(0.5 * torch.randn(_MAX_WORDS, dim))
-        self.out = nn.Linear(dim, size)
-        nn.init.normal_(self.out.weight, std=scale * dim**-0.5)
-        nn.init.zeros_(self.out.bias)
-        nn.init.zeros_(self.words.weight.data[1])
-
-    def forward(self, words: Tensor) -> Tensor:
-        embedded = self.words(words) * (1 + self.places[: words.shape[1]])
-        # Divided by the root, so that long and short instructions start with vectors of the same length.
-        return self.out(embedded.sum(1) / (words > 0).sum(1, keepdim=True) ** 0.5)
 
 
 def _parameters(*modules: nn.Module) -> list[nn.Parameter]:
