@@ -224,7 +224,7 @@ class VisionLanguageBackbone(nn.Module):
         return allowed | torch.eye(length, dtype=torch.bool, device=seen.device)
 
     def _additive(self, allowed: Tensor, dtype: torch.dtype) -> Any:
-        """What the language model adds, [n, 1, queries, keys]; one for each kind of its layers, where there are kinds."""
+        """What the language model adds, [n, 1, queries, keys]; by kind of its layers, where there are kinds."""
         mask = torch.zeros((), dtype=dtype, device=allowed.device)
         mask = torch.where(allowed, mask, torch.finfo(dtype).min)[:, None]
         return {kind: mask for kind in self._kinds} if "sliding_attention" in self._kinds else mask
@@ -263,3 +263,10 @@ def autocast(device: torch.device, dtype: torch.dtype) -> contextlib.AbstractCon
     if dtype == torch.float32 or not torch.amp.is_autocast_available(device.type):
         return contextlib.nullcontext()
     return torch.autocast(device.type, dtype=dtype)
+
+
+def full_precision(device: torch.device) -> contextlib.AbstractContextManager:
+    """Products as precise as what they are of, inside :func:`autocast`."""
+    if not torch.amp.is_autocast_available(device.type):
+        return contextlib.nullcontext()
+    return torch.autocast(device.type, enabled=False)
