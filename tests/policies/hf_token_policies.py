@@ -6,8 +6,8 @@ import functools
 import json
 
 import torch
-from hf_models import FAMILIES, RESOLUTION, TEXT, backbone, tokenizer
-from observations import INSTRUCTIONS
+from policies.hf_models import FAMILIES, RESOLUTION, TEXT, backbone, tokenizer
+from policies.observations import INSTRUCTIONS
 from tokenizers import Tokenizer
 
 from worldenv_trl.policies import HFTokenConfig, HFTokenPolicy

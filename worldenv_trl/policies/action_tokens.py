@@ -17,8 +17,8 @@ class QuantileActionTokenizer(ActionTokenizerBase):
     """OpenVLA's codec (TorchRL's ``VocabTailActionTokenizer``) between bounds that can be fitted and are saved.
 
     A number of an action, brought to [-1, 1] by its bounds and clipped, becomes one of ``num_bins`` tokens: 0 stands
-    for the highest edge, ``num_bins - 1`` for the lowest bin. A token becomes the centre of its bin. It computes in
-    float64, as the reference does in NumPy, and on the device of what it is given.
+    for the highest edge and beyond, ``num_bins - 1`` for the lowest bin. A token becomes the centre of its bin. It
+    computes in float64, as the reference does in NumPy, and on the device of what it is given.
 
     Args:
         num_bins: edges of the bins; there is one bin less, and the two highest tokens stand for the same one.
@@ -31,7 +31,7 @@ class QuantileActionTokenizer(ActionTokenizerBase):
         >>> tokenizer = QuantileActionTokenizer(256)
         >>> tokens = tokenizer.encode(torch.tensor([-1.0, -0.5, 0.0, 0.5, 1.0, 2.0, -2.0]))
         >>> tokens
-        tensor([255, 192, 128,  64,   0,   0, 255])
+        tensor([255, 192, 128,  64,   1,   0, 255])
         >>> tokenizer.set_bounds(torch.zeros(7), torch.full((7,), 0.5))
         >>> [round(value, 3) for value in tokenizer.decode(tokens).tolist()]
         [0.001, 0.124, 0.25, 0.375, 0.499, 0.499, 0.001]
