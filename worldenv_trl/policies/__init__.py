@@ -12,6 +12,7 @@ from worldenv_trl.policies.hf import HFConfig, HFPolicy
 from worldenv_trl.policies.hf_tokens import HFTokenConfig, HFTokenPolicy
 from worldenv_trl.policies.laplace import IndependentLaplace
 from worldenv_trl.policies.oft import OFTConfig, OFTPolicy
+from worldenv_trl.policies.openvla import load_openvla
 from worldenv_trl.policies.openvla_oft import load_openvla_oft
 from worldenv_trl.policies.pairing import check_pairing
 from worldenv_trl.policies.serving import ServedPolicy
@@ -41,6 +42,7 @@ __all__ = [
     "check_pairing",
     "laplace_actor",
     "likelihood_actor",
+    "load_openvla",
     "load_openvla_oft",
     "policy_actor",
     "random_shift",

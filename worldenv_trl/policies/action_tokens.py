@@ -67,4 +67,4 @@ class QuantileActionTokenizer(ActionTokenizerBase):
     def decode(self, tokens: Tensor) -> Tensor:
         """Actions float32 of tokens [..., 7]."""
         unit = self.unit.decode(tokens)
-        return (0.5 * (unit + 1) * (self.high - self.low + 1e-8) + self.low).float()
+        return (0.5 * (unit + 1) * (self.high - self.low) + self.low).float()

@@ -45,7 +45,7 @@ def check_kind(fields: dict[str, Any], folder: Path, wanted: str) -> None:
     elif "model_type" not in fields and {"type", "input_features"} & set(fields):
         found, reader = f"a LeRobot policy of type {fields.get('type')!r}", "LeRobot alone: it runs there, not here"
     elif fields.get("model_type") == "openvla" and wanted != "openvla":
-        found, reader = "an OpenVLA checkpoint", "load_openvla_oft"
+        found, reader = "an OpenVLA checkpoint", "load_openvla_oft, or load_openvla where it acts by tokens"
     elif fields.get("model_type") != "openvla" and wanted == "openvla":
         found, reader = f"a model of type {fields.get('model_type')!r}", "HFPolicy.from_backbone"
     else:
