@@ -149,7 +149,8 @@ class HFTokenPolicy(TokenPolicy, VisionLanguagePolicy):
     @torch.no_grad()
     def take_output_embeddings(self, rows: Tensor) -> None:
         """Reads action tokens out as a pretrained language head does, [vocabulary, dim]."""
-        self.action_head.weight.copy_(rows[self.first_action_id : self.first_action_id + self.config.num_bins])
+        if not rows.is_meta:  # an outline has no weights to give
+            self.action_head.weight.copy_(rows[self.first_action_id : self.first_action_id + self.config.num_bins])
 
     def _set_action_bounds(self, center: Tensor, half: Tensor) -> None:
         self.action_tokenizer.set_bounds(center - half, center + half)
