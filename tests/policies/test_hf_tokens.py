@@ -21,6 +21,7 @@ from worldenv_trl.policies import (
     HFPolicy,
     HFTokenConfig,
     HFTokenPolicy,
+    ServedPolicy,
     TeacherForcing,
     laplace_actor,
     policy_actor,
@@ -342,6 +343,13 @@ def test_other_actors_are_refused_with_the_one_that_suits():
         AutoregressiveActor(token_policy(), temperature=0.0)
     with pytest.raises(ValueError, match="event_dims must be 0 or 1, got 2"):
         AutoregressiveActor(token_policy(), event_dims=2)
+
+
+def test_a_server_answers_with_the_greedy_chunk():
+    policy, td = token_policy(), observed()
+    images = {"agentview": td[keys.IMAGE].numpy()}
+    actions, _ = ServedPolicy(policy)(images, td[keys.STATE].numpy(), policy.observed(td)[1][2])
+    assert torch.equal(torch.from_numpy(actions), policy_actor(policy)(td)[keys.CHUNK])
 
 
 def test_a_missing_camera_is_named():

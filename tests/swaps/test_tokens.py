@@ -52,7 +52,9 @@ def forgiving_expert(monkeypatch):
 @pytest.mark.parametrize("level", ["token", "chunk"])
 def test_a_token_policy_is_cloned_post_trained_and_evaluated(tiny, capsys, level):
     learning = dataclasses.replace(tiny.post_train, ratio_level=level, lora_rank=2)
-    config = dataclasses.replace(tiny, post_train=learning)
+    config = dataclasses.replace(
+        tiny, post_train=learning, explore=dataclasses.replace(tiny.explore, scale_factors=(0.0, 1.0))
+    )
     run_all(config, PARTS)
     folder = RunFolder(config.run_dir)
     assert all(folder.done(stage.name) for stage in plan(config))
