@@ -12,7 +12,6 @@ from config import WorldEnvConfig
 from parts import COMPACT, PROPRIO, Part, Parts, instructions
 from worldenv_trl.policies import HFPolicy, HFTokenPolicy, Policy, load_openvla, load_openvla_oft
 from worldenv_trl.policies.hf_files import check_weights, read_json
-from worldenv_trl.pretrained import OtherClassError
 from worldenv_trl.reflectors import Reflector, VLMReflector, VLMReflectorConfig
 from worldenv_trl.reflectors.video_language_model import VideoLanguageModel
 from worldenv_trl.scenes import load_task
@@ -64,15 +63,9 @@ def make_policy(config: WorldEnvConfig, device: str = "cpu") -> HFPolicy | HFTok
 
 
 def load_policy(folder: Path) -> HFPolicy | HFTokenPolicy:
-    """What :func:`make_policy` made, of the folder that it was saved to.
-
-    Raises:
-        FileNotFoundError, ValueError: see :meth:`~worldenv_trl.pretrained.Pretrained.from_pretrained`.
-    """
-    try:
-        return HFPolicy.from_pretrained(folder)
-    except OtherClassError:
-        return HFTokenPolicy.from_pretrained(folder)
+    """What ``save_pretrained`` of a policy of :func:`make_policy` wrote."""
+    tokens = read_json(folder, "config.json").get("class") == HFTokenPolicy.__name__
+    return (HFTokenPolicy if tokens else HFPolicy).from_pretrained(folder)
 
 
 def by_tokens(config: WorldEnvConfig) -> bool:
