@@ -168,7 +168,8 @@ class RealSize:
     """Local folders of pretrained parts, and what they are made with. Read with ``parts`` at ``real-size`` alone."""
 
     policy: Path | None = None
-    """A vision-language model as transformers' ``save_pretrained`` wrote it, or a checkpoint of OpenVLA-OFT."""
+    """A vision-language model as transformers' ``save_pretrained`` wrote it, or a checkpoint of OpenVLA or OpenVLA-OFT.
+    """
     statistics: str = ""
     """Key of the checkpoint's ``dataset_statistics.json``; the only one when empty."""
     action_head: str = "continuous"
