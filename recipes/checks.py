@@ -9,6 +9,7 @@ from loggers import check_loggers
 from parts import COMPACT, Parts
 from physics import tabletop
 from worldenv_trl.devices import choose_device
+from worldenv_trl.policies import Policy, TokenPolicy
 from worldenv_trl.reflectors import StopRule
 from worldenv_trl.scenes import load_task
 
@@ -27,6 +28,15 @@ def check_shares(config: WorldEnvConfig, processes: int) -> None:
         raise ValueError(
             f"{processes} processes of torchrun roll out their own groups: collectors must be local, got "
             f"{config.collectors!r}; workers serve a single process"
+        )
+
+
+def check_ratio_level(config: WorldEnvConfig, policy: Policy) -> None:
+    """Raises ``ValueError`` for a ratio of each token where the policy has none."""
+    if config.post_train.ratio_level == "token" and not isinstance(policy, TokenPolicy):
+        raise ValueError(
+            f"post_train.ratio_level must be step or chunk for {type(policy).__name__}, which does not act by tokens, "
+            "got 'token'"
         )
 
 
@@ -49,7 +59,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     for name, value, known in (
         ("post_train.env", config.post_train.env, ("imagined", "tabletop")),
         ("post_train.contexts", config.post_train.contexts, ("uniform", "mixed")),
-        ("post_train.ratio_level", config.post_train.ratio_level, ("step", "chunk")),
+        ("post_train.ratio_level", config.post_train.ratio_level, ("step", "chunk", "token")),
         ("parallel", config.parallel, MODES),
     ):
         if value not in known:
@@ -144,6 +154,8 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         make = part.make if part is getattr(COMPACT, name) else part.outline
         if make is not None:
             try:
-                make(config)
+                made = make(config)
+                if name == "policy":
+                    check_ratio_level(config, made)
             except ValueError as error:
                 raise ValueError(f"the {name.replace('_', ' ')} cannot be made of these settings: {error}") from error

@@ -64,7 +64,8 @@ class Explore:
     episodes_per_task: int = 160
     """Rounded up to whole waves of ``num_envs`` for each scale factor."""
     scale_factors: tuple[float, ...] = (0.0, 0.5, 1.0, 2.0)
-    """Multiples of the policy's Laplace scale; the episodes are shared out equally. 0 is the greedy policy."""
+    """Multiples of the policy's Laplace scale, or of its temperature if it acts by tokens; the episodes are shared out
+    equally. 0 is the greedy policy."""
     num_envs: int = 32
 
 
@@ -131,7 +132,8 @@ class PostTrain:
     minibatch_size: int = 256
     clip_epsilon: float = 0.1
     ratio_level: str = "step"
-    """``step`` (World-Env Eq. 5) or ``chunk``: one ratio for all steps of a chunk."""
+    """``step`` (World-Env Eq. 5), ``chunk``: one ratio for all steps of a chunk, or ``token``: one for each token of a
+    policy that acts by tokens."""
     lora_rank: int = 16
     """Of the adapters; at 0 the whole policy is updated instead, but for frozen encoders."""
     lora_lr: float = 2e-4
@@ -139,7 +141,8 @@ class PostTrain:
     averaging: float = 0.8
     """Decay per iteration of the running mean of the weights that is saved."""
     scale_factor: float = 1.0
-    """Behaviour and scored density use this multiple of the policy's scale."""
+    """Behaviour and scored density use this multiple of the policy's scale, or of its temperature if it acts by tokens.
+    """
     warmup_iterations: int = 2
     max_kl: float = 0.1
     """An iteration's updates stop when the approximate KL per step exceeds this."""
@@ -168,9 +171,13 @@ class RealSize:
     """Local folders of pretrained parts, and what they are made with. Read with ``parts`` at ``real-size`` alone."""
 
     policy: Path | None = None
-    """A vision-language model as transformers' ``save_pretrained`` wrote it, or a checkpoint of OpenVLA-OFT."""
+    """A vision-language model as transformers' ``save_pretrained`` wrote it, or a checkpoint of OpenVLA or OpenVLA-OFT.
+    """
     statistics: str = ""
     """Key of the checkpoint's ``dataset_statistics.json``; the only one when empty."""
+    action_head: str = "continuous"
+    """Of the policy: ``continuous`` (OpenVLA-OFT's heads, a Laplace density) or ``tokens`` (OpenVLA's, the vocabulary's
+    last tokens one after the other)."""
     reflector: Path | None = None
     """A LLaVA-OneVision or LLaVA-Video model as ``save_pretrained`` wrote it."""
     world_model: Path | None = None

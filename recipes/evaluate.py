@@ -19,7 +19,7 @@ from run import Run
 from run_folder import RunFolder
 from stages import run_alone
 from worldenv_trl.metrics import paired_test, wilson_interval
-from worldenv_trl.policies import laplace_actor
+from worldenv_trl.policies import policy_actor
 
 
 def evaluate(run: Run, before: str, after: str, models: str | None) -> None:
@@ -45,7 +45,7 @@ def evaluate(run: Run, before: str, after: str, models: str | None) -> None:
 def rolled(run: Run, protocol: str, name: str, judge: Judge | None) -> dict[str, torch.Tensor]:
     """Success bool ``[episodes]`` of a policy in every task; writes its recording."""
     config, policy = run.config, run.policy(name)
-    actor = laplace_actor(policy)
+    actor = policy_actor(policy)
 
     def about() -> dict[str, Any]:
         described = outcomes_env(config, config.tasks[0], "test", judge, 1, with_sim_state=True, proprio=policy.proprio)

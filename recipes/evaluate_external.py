@@ -26,7 +26,7 @@ from parts import Part
 from run import Run
 from stages import open_run, plan
 from worldenv_trl.metrics import wilson_interval
-from worldenv_trl.policies import ExternalPolicy, check_pairing, laplace_actor
+from worldenv_trl.policies import ExternalPolicy, check_pairing, policy_actor
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def compare(run: Run, policy: ExternalPolicy, settings: Settings) -> None:
                 torch.cat([*by_task.values()]),
             )
         if imagination is not None:
-            actor = laplace_actor(own.policy(name))
+            actor = policy_actor(own.policy(name))
             real, imagined = greedy_outcomes(own, actor, imagination, settings.imagined)
             folder.log(name, real_success=real.float().mean().item(), imagined_success=imagined.float().mean().item())
             _say(f"{name}, training contexts, physics", real)

@@ -23,7 +23,7 @@ from run_folder import RunFolder
 from threads import use_threads
 from two_worlds import TwoWorlds, imagine, live
 from worldenv_trl import keys
-from worldenv_trl.policies import laplace_actor
+from worldenv_trl.policies import policy_actor
 from worldenv_trl.report import RunRecord
 
 REAL, IMAGINED = "#1f6f8b", "#c8553d"
@@ -53,7 +53,7 @@ def main(settings: Settings) -> None:
         config = read_config(RunRecord.read(settings.run), settings.num_threads, settings.device)
         run = Run(config, RunFolder(settings.run))
         models = run.world_model(), run.reflector(), run.rules()
-        actor = laplace_actor(run.policy(settings.policy).eval())
+        actor = policy_actor(run.policy(settings.policy).eval())
     count = settings.state + 1
     episodes = live(run, actor, count)
     rows = torch.arange(len(config.tasks)) * count + settings.state

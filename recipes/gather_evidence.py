@@ -22,7 +22,7 @@ from worldenv_trl.data import Episodes, episodes_from_rollouts
 from worldenv_trl.data.episodes import concatenated
 from worldenv_trl.devices import choose_device
 from worldenv_trl.metrics import advantage_correlation, first_success, honesty, judged, moving_pixel_psnr
-from worldenv_trl.policies import laplace_actor
+from worldenv_trl.policies import policy_actor
 from worldenv_trl.record import read_rollouts
 from worldenv_trl.record.mcap.recording import Recording
 from worldenv_trl.reflectors import Reflector, StopRule
@@ -61,7 +61,7 @@ def gather(
     worlds: dict[str, TwoWorlds] = {}
     for name in policies:
         print(f"{name}: {episodes_per_task} held-out episodes a task, in the physics and in imagination")
-        actor = laplace_actor(run.policy(name).eval())
+        actor = policy_actor(run.policy(name).eval())
         worlds[name] = imagine(run, world_model, reflector, rules, live(run, actor, episodes_per_task))
     waves = []
     for path in _waves(record, suffix):

@@ -13,7 +13,7 @@ from config import WorldEnvConfig
 from parts import PROPRIO
 from seeds import stage_seed
 from worldenv_trl.envs import ContextSampler, TabletopEnv, chunked
-from worldenv_trl.policies import DeviceBridge, LaplaceActor, Policy, laplace_actor, scale_bounds
+from worldenv_trl.policies import AutoregressiveActor, DeviceBridge, LaplaceActor, Policy, policy_actor, scale_bounds
 from worldenv_trl.record import provenance
 
 
@@ -59,15 +59,16 @@ def physics_waves_env(
     return chunked(tabletop(config, "train", groups * group_size, None, **options), config.chunk_length)
 
 
-def chunk_player(actor: LaplaceActor, chunk_length: int) -> MultiStepActorWrapper:
+def chunk_player(actor: LaplaceActor | AutoregressiveActor, chunk_length: int) -> MultiStepActorWrapper:
     """Plays the actor's chunks open loop, one action a step. Its log-probs are stale: never train on them."""
     return MultiStepActorWrapper(DeviceBridge(actor), n_steps=chunk_length)
 
 
-def exploring_actor(config: WorldEnvConfig, policy: Policy, scale_factor: float) -> LaplaceActor:
-    """The stochastic actor of exploration and LOOP, its scale bounded below."""
+def exploring_actor(config: WorldEnvConfig, policy: Policy, scale_factor: float) -> LaplaceActor | AutoregressiveActor:
+    """The stochastic actor of exploration and LOOP, a Laplace scale bounded below."""
     bounds = scale_bounds(policy, config.scale_floor, share=config.scale_share)
-    return laplace_actor(policy, scale_factor=scale_factor, log_scale_bounds=bounds)
+    events = 0 if config.post_train.ratio_level == "token" else 1
+    return policy_actor(policy, scale_factor=scale_factor, log_scale_bounds=bounds, event_dims=events)
 
 
 def recording(config: WorldEnvConfig, env: EnvBase, stage: str, models: dict | None = None, **more: Any) -> dict:

@@ -28,7 +28,7 @@ from worldenv_trl import keys
 from worldenv_trl.envs import ContextSampler, FramesAside
 from worldenv_trl.metrics import HonestyAlarm
 from worldenv_trl.objectives import LOOPLoss, rloo_advantage
-from worldenv_trl.policies import Policy, laplace_actor
+from worldenv_trl.policies import Policy, TokenPolicy, policy_actor
 from worldenv_trl.record import RolloutWriter
 
 
@@ -62,10 +62,14 @@ def post_train(
     sampler = ContextSampler() if settings.contexts == "mixed" else None
     waves = Waves(run, target, models, actor, sampler)
     imagination = waves.imagination
+    read = [*policy.in_keys, *([keys.TOKENS] if isinstance(policy, TokenPolicy) else [])]
 
     def make_loss(part: Policy) -> LOOPLoss:
         scored = actor if part is policy else exploring_actor(config, part, settings.scale_factor)
-        return LOOPLoss(scored, clip_epsilon=settings.clip_epsilon, ratio_level=settings.ratio_level, functional=False)
+        loss = LOOPLoss(scored, clip_epsilon=settings.clip_epsilon, ratio_level=settings.ratio_level, functional=False)
+        if isinstance(part, TokenPolicy):
+            loss.set_keys(action=keys.TOKENS)
+        return loss
 
     learner = DataParallel(policy, make_loss, config.parallel)
     groups = {name: learner.trained(parameters) for name, parameters in groups.items()}
@@ -80,7 +84,7 @@ def post_train(
     # Single iterations are noisy: what is probed and saved is a running mean of the weights they reach.
     mean = AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(settings.averaging))
     averaged = cast(Policy, mean.module)
-    mean_actor = laplace_actor(averaged)
+    mean_actor = policy_actor(averaged)
 
     probed, recorded = probed_iterations(settings), {0, settings.iterations - 1}
     alarm = HonestyAlarm(len(probed), false_alarm_rate=settings.false_alarm_rate) if probed and imagination else None
@@ -108,7 +112,7 @@ def post_train(
         about = {}
         if iteration in recorded and processes.is_main():  # of the weights that collected it
             about = recording(config, waves.env, target, {"policy": policy} | waves.judges, iteration=iteration)
-        metrics = update(mine, policy.in_keys, learner, optimizer, list(groups.values()), settings)
+        metrics = update(mine, read, learner, optimizer, list(groups.values()), settings)
         learner.gather()
         counts["stuck"] = stuck(counts["stuck"], metrics)
         if counts["stuck"] == PATIENCE and processes.is_main():
@@ -116,7 +120,7 @@ def post_train(
         if about:
             if wave is not mine:
                 wave[keys.ADVANTAGE] = _expanded(advantage, wave)
-            wave.update(ratios(wave, policy.in_keys, make_loss(policy)))
+            wave.update(ratios(wave, read, make_loss(policy)))
             _write(run, f"{target}_{iteration:03d}", about, wave, waves.aside)
         mean.update_parameters(policy)
         waves.update_policy_weights_()

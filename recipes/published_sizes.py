@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,8 +12,9 @@ from tokenizers import Tokenizer, models, pre_tokenizers, processors
 from transformers import AutoModelForImageTextToText, LlavaOnevisionConfig
 
 from config import WorldEnvConfig
-from real_parts import outlined_world_model, policy_settings, reflector_config
+from real_parts import by_tokens, outlined_world_model, policy_settings, reflector_config
 from worldenv_trl.policies.hf import HFConfig, HFPolicy
+from worldenv_trl.policies.hf_tokens import HFTokenConfig, HFTokenPolicy
 from worldenv_trl.policies.prismatic import PrismaticConfig, dinosiglip_towers
 from worldenv_trl.reflectors import VLMReflector
 from worldenv_trl.reflectors.video_language_model import VideoLanguageModel
@@ -35,11 +37,12 @@ def openvla_oft_7b() -> PrismaticConfig:
     return PrismaticConfig(LLAMA_2_7B, {"image_size": 224, "towers": towers})
 
 
-def words() -> Tokenizer:
-    """One token a word: prompts come out about as long as with a real tokenizer."""
+def words(action_tokens: Sequence[int] = ()) -> Tokenizer:
+    """One token a word: prompts come out about as long as with a real tokenizer; and tokens of these ids."""
     special = ["<s>", "<fake_token_around_image>", "<global-img>"]
     known = [*special, *HFConfig.prompt.format(instruction=INSTRUCTION).replace(":", " : ").replace("?", " ? ").split()]
     numbers = {word: number for number, word in enumerate(dict.fromkeys(["<unk>", *known]))}
+    numbers |= {f"<{number}>": number for number in action_tokens}
     tokenizer = Tokenizer(models.WordLevel(numbers, unk_token="<unk>"))
     tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
     tokenizer.add_special_tokens(special)
@@ -72,10 +75,14 @@ class WordTokens:
         return SimpleNamespace(input_ids=[self._video_token if "<video>" in word else place for place, word in words])
 
 
-def outlined_policy(config: WorldEnvConfig) -> HFPolicy:
-    """OpenVLA-OFT-7B on the meta device."""
+def outlined_policy(config: WorldEnvConfig) -> HFPolicy | HFTokenPolicy:
+    """OpenVLA-OFT-7B on the meta device, or OpenVLA-7B, which acts by tokens."""
     settings = policy_settings(config) | {"chunk_length": 8, "proprio_format": "libero", "readout_shift": 1}
     with torch.device("meta"):
+        if by_tokens(config):
+            tokens = policy_settings(config) | {"chunk_length": config.chunk_length, "action_token_end": 32000}
+            backbone = openvla_oft_7b().to_dict()
+            return HFTokenPolicy(HFTokenConfig(backbone=backbone, **tokens), words(range(31744, 32000)))
         return HFPolicy(HFConfig(backbone=openvla_oft_7b().to_dict(), **settings), words())
 
 

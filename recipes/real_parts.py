@@ -10,7 +10,7 @@ import torch
 
 from config import WorldEnvConfig
 from parts import COMPACT, PROPRIO, Part, Parts, instructions
-from worldenv_trl.policies import HFPolicy, Policy, load_openvla_oft
+from worldenv_trl.policies import HFPolicy, HFTokenPolicy, Policy, load_openvla, load_openvla_oft
 from worldenv_trl.policies.hf_files import check_weights, read_json
 from worldenv_trl.reflectors import Reflector, VLMReflector, VLMReflectorConfig
 from worldenv_trl.reflectors.video_language_model import VideoLanguageModel
@@ -18,6 +18,7 @@ from worldenv_trl.scenes import load_task
 from worldenv_trl.world_models import DiffusionWorldModel, DiffusionWorldModelConfig, WorldModel, load_diffusers
 
 NAMES = ("compact", "real-size")
+ACTION_HEADS = ("continuous", "tokens")
 
 
 def parts_of(config: WorldEnvConfig) -> Parts:
@@ -31,8 +32,8 @@ def parts_of(config: WorldEnvConfig) -> Parts:
     return REAL_SIZE if config.parts == "real-size" else COMPACT
 
 
-def make_policy(config: WorldEnvConfig, device: str = "cpu") -> HFPolicy:
-    """OpenVLA-OFT's checkpoint, or its recipe over a vision-language model.
+def make_policy(config: WorldEnvConfig, device: str = "cpu") -> HFPolicy | HFTokenPolicy:
+    """A checkpoint of OpenVLA-OFT or OpenVLA, or the recipe of one of them over a vision-language model.
 
     Raises:
         FileNotFoundError: if the folder lacks a file.
@@ -40,7 +41,18 @@ def make_policy(config: WorldEnvConfig, device: str = "cpu") -> HFPolicy:
     """
     folder = _named(config, "policy")
     settings = policy_settings(config)
-    if read_json(folder, "config.json").get("model_type") != "openvla":
+    openvla = read_json(folder, "config.json").get("model_type") == "openvla"
+    if by_tokens(config):
+        settings["chunk_length"] = config.chunk_length
+        if not openvla:
+            return HFTokenPolicy.from_backbone(folder, device=device, **settings)
+        if len(settings["cameras"]) != 1:
+            raise ValueError(
+                f"{folder} was trained with 1 camera, got {len(settings['cameras'])} "
+                f"({', '.join(settings['cameras'])}): --sft.cameras {settings['cameras'][0]}"
+            )
+        return load_openvla(folder, statistics=config.real_size.statistics or None, device=device, **settings)
+    if not openvla:
         return HFPolicy.from_backbone(folder, device=device, chunk_length=config.chunk_length, **settings)
     if (config.sft.cameras and len(config.sft.cameras) != 2) or len(config.cameras) != 2:
         raise ValueError(
@@ -50,8 +62,26 @@ def make_policy(config: WorldEnvConfig, device: str = "cpu") -> HFPolicy:
     return load_openvla_oft(folder, statistics=config.real_size.statistics or None, device=device, **settings)
 
 
+def load_policy(folder: Path) -> HFPolicy | HFTokenPolicy:
+    """What ``save_pretrained`` of a policy of :func:`make_policy` wrote."""
+    tokens = read_json(folder, "config.json").get("class") == HFTokenPolicy.__name__
+    return (HFTokenPolicy if tokens else HFPolicy).from_pretrained(folder)
+
+
+def by_tokens(config: WorldEnvConfig) -> bool:
+    """Whether the policy is to act by tokens.
+
+    Raises:
+        ValueError: for a head that is not known.
+    """
+    head = config.real_size.action_head
+    if head not in ACTION_HEADS:
+        raise ValueError(f"real_size.action_head must be one of {', '.join(ACTION_HEADS)}, got {head!r}")
+    return head == "tokens"
+
+
 def policy_settings(config: WorldEnvConfig) -> dict[str, Any]:
-    """Fields of :class:`~worldenv_trl.policies.HFConfig` that the run decides."""
+    """Fields of :class:`~worldenv_trl.policies.HFConfig`, or of its like for tokens, that the run decides."""
     return {
         "instructions": instructions(config),
         "cameras": config.sft.cameras or config.cameras,
@@ -137,7 +167,7 @@ def _named(config: WorldEnvConfig, part: str) -> Path:
 
 
 REAL_SIZE = Parts(
-    policy=Part[Policy](make_policy, HFPolicy.from_pretrained, partial(make_policy, device="meta")),
+    policy=Part[Policy](make_policy, load_policy, partial(make_policy, device="meta")),
     world_model=Part[WorldModel](
         make_world_model, DiffusionWorldModel.from_pretrained, partial(make_world_model, device="meta")
     ),

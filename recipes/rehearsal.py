@@ -22,7 +22,7 @@ from worldenv_trl import keys
 from worldenv_trl.data import Episodes
 from worldenv_trl.devices import device_of
 from worldenv_trl.kinematics import ForwardKinematics
-from worldenv_trl.policies import Policy
+from worldenv_trl.policies import Policy, TeacherForcing, TokenPolicy, token_cross_entropy
 from worldenv_trl.reflectors import Reflector, VLMReflector
 from worldenv_trl.row_texts import row_texts
 from worldenv_trl.world_models import DiffusionWorldModel, WorldModel, request
@@ -43,8 +43,9 @@ class Rehearsal:
     sizes: dict[str, Size] = field(default_factory=dict)
     """By part; ``sft`` is the policy as supervised fine-tuning updates it."""
     calls: dict[str, Call] = field(default_factory=dict)
-    """``decide``, ``sft``, ``update``: a decision of the policy; ``imagine``, ``dream``: a chunk of the world model,
-    painted and learned from; ``see``, ``judge``: a frame and a prefix; ``learn``: all of the reflector's lessons."""
+    """``decide``, ``sft``, ``update``: a decision of the policy, and ``score``, one pass over it, where it acts by
+    tokens; ``imagine``, ``dream``: a chunk of the world model, painted and learned from; ``see``, ``judge``: a frame
+    and a prefix; ``learn``: all of the reflector's lessons."""
     kept_bytes: float = 0.0
     """That the reflector keeps of every frame of a video, or where ``learn`` is known of a video."""
     judgements: int = 1
@@ -131,10 +132,16 @@ def _act(found: Rehearsal, config: WorldEnvConfig, made: dict[str, Any]) -> None
         seen[keys.image_key(camera)] = _pixels(config, ROWS, device=device)
     seen.set(keys.INSTRUCTION, row_texts(texts))
 
-    def learn() -> None:
+    def score() -> Tensor:
+        if isinstance(policy, TokenPolicy):
+            tokens = torch.zeros(ROWS, policy.chunk_length, keys.ACTION_DIM, dtype=torch.int64, device=device)
+            logits = TeacherForcing(policy)(seen.clone(False).set(keys.TOKENS, tokens))[keys.TOKENS]
+            return token_cross_entropy(logits, tokens).mean()
         out = policy(seen.clone(False))
-        error = out[keys.LOC].abs() / out[keys.LOG_SCALE].exp() + out[keys.LOG_SCALE]
-        error.mean().backward()
+        return (out[keys.LOC].abs() / out[keys.LOG_SCALE].exp() + out[keys.LOG_SCALE]).mean()
+
+    def learn() -> None:
+        score().backward()
 
     found.sizes["sft"] = size(policy)
     found.calls["sft"] = counted(policy, ROWS, learn, training=True)
@@ -143,6 +150,8 @@ def _act(found: Rehearsal, config: WorldEnvConfig, made: dict[str, Any]) -> None
     same = found.sizes["policy"] == found.sizes["sft"]
     found.calls["update"] = found.calls["sft"] if same else counted(policy, ROWS, learn, training=True)
     found.calls["decide"] = counted(policy, ROWS, lambda: made.update(acted=policy(seen.clone(False))))
+    if isinstance(policy, TokenPolicy):
+        found.calls["score"] = counted(policy, ROWS, score)
     chunk = made["acted"][keys.LOC]
     wanted = (ROWS, config.chunk_length, keys.ACTION_DIM)
     if tuple(chunk.shape) != wanted:

@@ -23,7 +23,7 @@ import tyro
 from command_line import one_line_errors
 from parts import COMPACT, Kind, Part, Parts
 from worldenv_trl.devices import choose_device
-from worldenv_trl.policies import LaplaceActor, Policy, laplace_actor, scale_bounds
+from worldenv_trl.policies import AutoregressiveActor, LaplaceActor, Policy, policy_actor, scale_bounds
 from worldenv_trl.record import model_hash, parse_edit, read_metadata, replay
 from worldenv_trl.record.replay.source import open_rollout
 
@@ -110,13 +110,13 @@ def main(options: Options, parts: Parts = COMPACT) -> int:
     return 0
 
 
-def recorded_actor(policy: Policy, settings: Mapping[str, Any]) -> LaplaceActor:
+def recorded_actor(policy: Policy, settings: Mapping[str, Any]) -> LaplaceActor | AutoregressiveActor:
     """The policy with the noise of exploration and LOOP, as the ``settings`` of a recording's run have it; with its own
     trained scale where there are none."""
     if "scale_floor" not in settings:
-        return laplace_actor(policy)
+        return policy_actor(policy)
     bounds = scale_bounds(policy, tuple(settings["scale_floor"]), share=settings["scale_share"])
-    return laplace_actor(policy, scale_factor=settings["post_train"]["scale_factor"], log_scale_bounds=bounds)
+    return policy_actor(policy, scale_factor=settings["post_train"]["scale_factor"], log_scale_bounds=bounds)
 
 
 def _checkpoint(part: Part[Kind], name: str | None, file: Path, metadata: dict, kind: str) -> Kind:

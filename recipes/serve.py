@@ -17,8 +17,17 @@ import tyro
 from command_line import one_line_errors
 from threads import use_threads
 from worldenv_trl.devices import choose_device
-from worldenv_trl.policies import HFPolicy, OFTPolicy, Policy, ServedPolicy, load_openvla_oft
+from worldenv_trl.policies import (
+    HFPolicy,
+    HFTokenPolicy,
+    OFTPolicy,
+    Policy,
+    ServedPolicy,
+    load_openvla,
+    load_openvla_oft,
+)
 from worldenv_trl.policies.bridge import serve
+from worldenv_trl.policies.hf_files import read_json
 from worldenv_trl.pretrained import OtherClassError
 from worldenv_trl.record import model_hash
 
@@ -26,7 +35,7 @@ from worldenv_trl.record import model_hash
 @dataclass(frozen=True)
 class Settings:
     checkpoint: tyro.conf.Positional[str]
-    """Folder or Hub id of an OFTPolicy or HFPolicy, or folder of an OpenVLA-OFT release."""
+    """Folder or Hub id of an OFTPolicy, HFPolicy or HFTokenPolicy, or folder of a release of OpenVLA or OpenVLA-OFT."""
     address: str = "127.0.0.1:8765"
     """``host:port``, port 0 for any free one, or ``unix:/path``. It answers whoever reaches it."""
     device: str = "auto"
@@ -50,12 +59,16 @@ def load_policy(checkpoint: str, device: torch.device) -> Policy:
         FileNotFoundError: if there is none.
         ValueError: if it is one of another kind.
     """
-    if (Path(checkpoint) / "dataset_statistics.json").exists():
-        return load_openvla_oft(checkpoint, device=device)
-    try:
-        return OFTPolicy.from_pretrained(checkpoint, device=device)
-    except OtherClassError:
-        return HFPolicy.from_pretrained(checkpoint, device=device)
+    folder = Path(checkpoint)
+    if (folder / "config.json").is_file() and read_json(folder, "config.json").get("model_type") == "openvla":
+        release = load_openvla_oft if any(folder.glob("action_head--*")) else load_openvla
+        return release(folder, device=device)
+    for kind in (OFTPolicy, HFPolicy):
+        try:
+            return kind.from_pretrained(checkpoint, device=device)
+        except OtherClassError:
+            continue
+    return HFTokenPolicy.from_pretrained(checkpoint, device=device)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""Supervised fine-tuning: L1 on action chunks, then the Laplace scale head alone (World-Env Eq. 8).
+"""Supervised fine-tuning: L1 on action chunks, then the Laplace scale head alone (World-Env Eq. 8); cross-entropy of a
+policy that acts by tokens.
 
 Alone: ``python recipes/sft.py improve --run-dir runs/improve``.
 """
@@ -13,9 +14,11 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torchrl.objectives import BCLoss
 
 import processes
+from checks import check_ratio_level
 from data_parallel import DataParallel, WholeOptimizer
 from episodes import demonstrations
 from resumable import Resumable
@@ -23,18 +26,49 @@ from run import Run
 from stages import run_alone
 from worldenv_trl import keys
 from worldenv_trl.data import policy_samples
-from worldenv_trl.devices import to_device
-from worldenv_trl.policies import Policy, laplace_actor, likelihood_actor, random_shift
+from worldenv_trl.devices import device_of, to_device
+from worldenv_trl.policies import (
+    Policy,
+    TeacherForcing,
+    TokenPolicy,
+    laplace_actor,
+    likelihood_actor,
+    random_shift,
+    token_cross_entropy,
+)
 from worldenv_trl.row_share import own_rows
 
 
 def fine_tune(run: Run) -> None:
     """Reads ``rollouts/demonstrations.mcap``, writes ``checkpoints/sft``."""
-    config, settings = run.config, run.config.sft
+    config = run.config
     run.seed_everything("sft")
     samples = policy_samples(demonstrations(run), config.chunk_length)
     policy = run.parts.policy.make(config).to(run.device)
+    check_ratio_level(config, policy)
     policy.fit_statistics(samples[keys.STATE], samples[keys.CHUNK])
+    if isinstance(policy, TokenPolicy):
+        _clone_tokens(policy, samples, run)
+    else:
+        _clone_chunks(policy, samples, run)
+    if processes.is_main():
+        policy.save_pretrained(run.folder.checkpoint("sft"))
+
+
+def _clone_tokens(policy: TokenPolicy, samples: TensorDictBase, run: Run) -> None:
+    settings = run.config.sft
+    tokenizer = policy.action_tokenizer
+    samples[keys.TOKENS] = tokenizer.encode(samples[keys.CHUNK].to(device_of(policy))).to(samples[keys.CHUNK].device)
+    learning = [parameter for parameter in policy.parameters() if parameter.requires_grad]
+
+    def cross_entropy(part: TokenPolicy) -> BCLoss:
+        return _behaviour_cloning(TeacherForcing(part), keys.TOKENS, loss_function=token_cross_entropy)
+
+    _train(policy, cross_entropy, samples, learning, settings.steps, settings.lr, run, "cross_entropy")
+
+
+def _clone_chunks(policy: Policy, samples: TensorDictBase, run: Run) -> None:
+    settings = run.config.sft
     scale = list(policy.scale_parameters())
     learning = [parameter for parameter in policy.parameters() if parameter.requires_grad]
     others = [parameter for parameter in learning if all(parameter is not each for each in scale)]
@@ -53,21 +87,19 @@ def fine_tune(run: Run) -> None:
         return _behaviour_cloning(likelihood_actor(part))
 
     _train(policy, nll, samples, scale, settings.scale_steps, settings.scale_lr, run, "nll")
-    if processes.is_main():
-        policy.save_pretrained(run.folder.checkpoint("sft"))
 
 
-def _behaviour_cloning(actor: TensorDictModuleBase, **options: Any) -> BCLoss:
+def _behaviour_cloning(actor: TensorDictModuleBase, action: NestedKey = keys.CHUNK, **options: Any) -> BCLoss:
     with warnings.catch_warnings():  # about its own annotations
         warnings.simplefilter("ignore", UserWarning)
         loss = BCLoss(actor, **options)
-    loss.set_keys(action=keys.CHUNK, pad_mask=keys.ACTION_IS_PAD)
+    loss.set_keys(action=action, pad_mask=keys.ACTION_IS_PAD)
     return loss
 
 
 def _train(
     policy: Policy,
-    make_loss: Callable[[Policy], BCLoss],
+    make_loss: Callable[[Any], BCLoss],
     samples: TensorDictBase,
     parameters: list[torch.nn.Parameter],
     steps: int,

@@ -124,7 +124,8 @@ def stage_flops(kind: str, config: WorldEnvConfig, found: Rehearsal, *, refit: b
     decide, episodes = calls["decide"].flops, explored(config)
     judged = config.post_train.env == "imagined"
     if kind == "sft":
-        steps = config.sft.steps * calls["sft"].flops + config.sft.scale_steps * decide
+        scale = 0.0 if "score" in calls else decide  # tokens have no scale head
+        steps = config.sft.steps * calls["sft"].flops + config.sft.scale_steps * scale
         return config.sft.batch_size * steps
     if kind == "explore":
         return episodes * length * decide
@@ -216,7 +217,7 @@ def moved_bytes(config: WorldEnvConfig, found: Rehearsal, machine: Machine) -> d
         seen = math.ceil(videos * config.chunk_length / _FRAMES_SEEN) * calls["see"].read_bytes
         judged = math.ceil(videos * found.judgements / _PROMPTS_AT_ONCE) * calls["judge"].read_bytes
         lived += length * (painted + seen + judged)
-    updated = updates * (2 * calls["decide"].read_bytes + gradients)
+    updated = updates * (2 * calls.get("score", calls["decide"]).read_bytes + gradients)
     return {"whole": updates * 2 * share * gradients, "sharded": share * (lived + updated)}
 
 

@@ -47,7 +47,7 @@ def update(
     Args:
         wave: [G, N, T] with advantages, on whatever device; what is learned from goes to the policy's, once. Of several
             processes each has groups of its own, and a minibatch is theirs together.
-        in_keys: what the policy reads.
+        in_keys: what the policy reads, and the tokens of one that acts by tokens.
         learner: of a :class:`LOOPLoss`, whose minibatches add up.
 
     Decisions without an advantage teach nothing and are left out, but count among Eq. 5's steps. If there is no other

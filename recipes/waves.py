@@ -20,10 +20,11 @@ from run import Run
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import ContextSampler, FramesAside
-from worldenv_trl.policies import DeviceBridge, LaplaceActor
+from worldenv_trl.policies import AutoregressiveActor, DeviceBridge, LaplaceActor
 
 _LEARNED_FROM = (
     keys.CHUNK,
+    keys.TOKENS,
     keys.LOG_PROBS,
     keys.MASK,
     keys.TASK_ID,
@@ -48,7 +49,14 @@ class Waves:
     collector: GroupCollector | None = None
     imagination: Imagination | None = None
 
-    def __init__(self, run: Run, target: str, models: str, actor: LaplaceActor, sampler: ContextSampler | None) -> None:
+    def __init__(
+        self,
+        run: Run,
+        target: str,
+        models: str,
+        actor: LaplaceActor | AutoregressiveActor,
+        sampler: ContextSampler | None,
+    ) -> None:
         settings, size = run.config.post_train, run.config.post_train.group_size
         self._groups, self._read = settings.groups // processes.size(), [*actor.policy.in_keys, *_LEARNED_FROM]
         self._workers, seed = run.workers is not None, run.seed(target, "env")

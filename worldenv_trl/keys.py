@@ -32,7 +32,7 @@ LOGITS = ("vla_action", "logits")  # float [*B, C, 7, V], over the V tokens that
 LOC = ("vla_action", "loc")  # float32 [*B, C, 7]
 SCALE = ("vla_action", "scale")  # float32 [*B, C, 7], exp(log-scale)
 LOG_SCALE = ("vla_action", "log_scale")  # float32 [*B, C, 7], the scale head's raw output
-LOG_PROBS = ("vla_action", "log_probs")  # float32 [*B, C], summed over the 7 dimensions
+LOG_PROBS = ("vla_action", "log_probs")  # float32 [*B, C], summed over the 7 dimensions; of single tokens [*B, C, 7]
 ACTION_IS_PAD = "action_is_pad"  # bool [*B, C]
 
 FRAMES = "frames"  # ("frames", entry) uint8 [*B, C, 3, H, W] by camera, what one decision produced; see frames_key

@@ -35,7 +35,7 @@ from run import Run
 from run_folder import RunFolder
 from stages import open_run, rerun
 from worldenv_trl.metrics import advantage_correlation
-from worldenv_trl.policies import Policy, laplace_actor
+from worldenv_trl.policies import Policy, policy_actor
 
 _SHARED = ("tasks", "cameras", "image_size", "chunk_length", "max_steps")  # a policy is of these
 
@@ -83,7 +83,7 @@ class Measured:
         if iterations not in self.at:
             return
         config, sampled = self.run.config, self.settings.sampled
-        actors = {"greedy": (laplace_actor(policy), ExplorationType.DETERMINISTIC)}
+        actors = {"greedy": (policy_actor(policy), ExplorationType.DETERMINISTIC)}
         if sampled:
             actor = exploring_actor(config, policy, config.post_train.scale_factor)
             actors["sampled"] = (actor, ExplorationType.RANDOM)

@@ -11,12 +11,13 @@ from transformers import LlavaConfig, PaliGemmaConfig, PretrainedConfig, SmolVLM
 
 from published_sizes import INSTRUCTION, LLAMA_2_7B, openvla_oft_7b, words
 from worldenv_trl.keys import ACTION_DIM, STATE_DIM
-from worldenv_trl.policies.hf import HFConfig, HFPolicy
+from worldenv_trl.policies import HFConfig, HFPolicy, HFTokenConfig, HFTokenPolicy, Policy, token_cross_entropy
 from worldenv_trl.policies.prismatic import PrismaticConfig
 
 CAMERAS = ("agentview", "wrist")
 IMAGE_SIZE = 256  # px, LIBERO's
 RANK = 32
+ACTION_IDS = range(31744, 32000)  # OpenVLA's action tokens
 Inputs = tuple[dict[str, Tensor], Tensor, list[str]]
 
 
@@ -98,18 +99,18 @@ def make(backbone: PretrainedConfig | PrismaticConfig) -> HFPolicy:
     return HFPolicy(config, words())
 
 
-def inputs(policy: HFPolicy, batch: int) -> Inputs:
+def inputs(policy: Policy, batch: int) -> Inputs:
     device = policy.action_range.device
     shape = (batch, 3, IMAGE_SIZE, IMAGE_SIZE)
-    images = {camera: torch.randint(0, 256, shape, dtype=torch.uint8, device=device) for camera in CAMERAS}
+    images = {camera: torch.randint(0, 256, shape, dtype=torch.uint8, device=device) for camera in policy.cameras}
     return images, torch.zeros(batch, STATE_DIM, device=device), [INSTRUCTION] * batch
 
 
-def decide(policy: HFPolicy, observed: Inputs) -> tuple[Tensor, Tensor]:
+def decide(policy: Policy, observed: Inputs) -> tuple[Tensor, Tensor]:
     return policy.predict(*observed)
 
 
-def learning(policy: HFPolicy) -> list[nn.Parameter]:
+def learning(policy: Policy) -> list[nn.Parameter]:
     return [parameter for group in policy.post_training_parameters(RANK).values() for parameter in group]
 
 
@@ -119,7 +120,35 @@ def negative_log_likelihood(policy: HFPolicy, observed: Inputs) -> Tensor:
     return (loc.abs() / log_scale.exp() + log_scale).sum() / (loc.shape[0] * ACTION_DIM)
 
 
-def compile_layers(policy: HFPolicy) -> None:
+def make_tokens() -> HFTokenPolicy:
+    """OpenVLA-7B: one camera, chunks of eight actions."""
+    config = HFTokenConfig(
+        backbone=openvla_oft_7b().to_dict(),
+        instructions=(INSTRUCTION,),
+        cameras=CAMERAS[:1],
+        image_size=IMAGE_SIZE,
+        action_token_end=ACTION_IDS[-1] + 1,
+        lora_rank=RANK,
+        dtype="bfloat16",
+        gradient_checkpointing=True,
+    )
+    return HFTokenPolicy(config, words(ACTION_IDS))
+
+
+def cross_entropy(policy: HFTokenPolicy, observed: Inputs) -> Tensor:
+    """Of one token for every number of the chunk: the pass that cloning and LOOP make."""
+    rows = observed[1].shape[0]
+    tokens = torch.zeros(rows, policy.chunk_length, ACTION_DIM, dtype=torch.int64, device=observed[1].device)
+    return token_cross_entropy(policy.logits(*observed, tokens), tokens).mean()
+
+
+def read_by_later_tokens(policy: HFTokenPolicy) -> int:
+    """The language model's layers and the head, for every token but the first."""
+    read = [*policy.backbone.language_model.layers.parameters(), *policy.action_head.parameters()]
+    return (policy.chunk_length * ACTION_DIM - 1) * sum(each.numel() * each.element_size() for each in read)
+
+
+def compile_layers(policy: nn.Module) -> None:
     """Layer by layer: equal layers share one graph."""
     for module in policy.modules():
         if type(module).__name__.endswith(("DecoderLayer", "EncoderLayer")):
@@ -141,6 +170,17 @@ def row(name: str, backbone: PretrainedConfig | PrismaticConfig) -> Row:
 
 ROWS = (
     row("openvla-oft-7b", openvla_oft_7b()),
+    Row(
+        name="policy-openvla-7b-tokens",
+        unit="decision",
+        make=make_tokens,
+        inputs=inputs,
+        call=decide,
+        train=learning,
+        loss=cross_entropy,
+        compile=compile_layers,
+        read_again=read_by_later_tokens,
+    ),
     row("llava-7b", llava_7b()),
     row("paligemma-3b", paligemma_3b()),
     row("smolvlm-500m", smolvlm_500m()),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -38,6 +38,8 @@ class Row:
     train_batch: int = 4
     units_per_row: int = 1
     """How many units one row is: frames of an imagined chunk."""
+    read_again: Callable[[nn.Module], int] = lambda module: 0
+    """Bytes of the parameters that a call reads more than once, each time counted but the first."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,8 @@ class Work:
     peak_bytes: int
     """Of what it allocates beside weights and inputs: activations, and gradients of a training step."""
     read_bytes: int
-    """Of the parameters that it reads: all of them, but for a head that learns from what was computed once."""
+    """Of the parameters that it reads: all of them, but for a head that learns from what was computed once; those that
+    tokens one after the other read again as often."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,9 @@ def costs(row: Row) -> Costs:
     with torch.device("meta"):
         module = row.make()
         parameters, weight_bytes = _size(module.parameters())
-        calls = tuple(_work(row.call, module, row.inputs(module, batch), batch, False) for batch in row.call_batches)
+        again = row.read_again(module)
+        once = (_work(row.call, module, row.inputs(module, batch), batch, False) for batch in row.call_batches)
+        calls = tuple(replace(work, read_bytes=work.read_bytes + again) for work in once)
         learning = list(row.train(module))
         trainable, gradient_bytes = _size(learning)
         inputs = row.inputs(module, row.train_batch)

@@ -24,7 +24,7 @@ from run_folder import RunFolder
 from sft import fine_tune
 from threads import use_threads
 from worldenv_trl.metrics import wilson_interval
-from worldenv_trl.policies import laplace_actor
+from worldenv_trl.policies import policy_actor
 from worldenv_trl.scenes import list_tasks, load_task
 
 
@@ -66,7 +66,7 @@ def main(settings: Settings) -> None:
     demonstrate(run)
     fine_tune(run)
     run.seed_everything("evaluate")
-    actor = laplace_actor(run.policy("sft"))
+    actor = policy_actor(run.policy("sft"))
     print("| task | solved |\n|---|---|")
     everything = []
     for task in tasks:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -125,3 +126,20 @@ def test_backbones_have_the_sizes_that_were_published(name, published, without):
         policy = row.make()
     base = [p for label, p in policy.backbone.model.named_parameters() if "lora_" not in label]
     assert sum(parameter.numel() for parameter in base) == published - without
+
+
+def test_tokens_one_after_the_other_read_the_language_model_again_for_each():
+    pytest.importorskip("transformers")
+    from policies.hf_token_policies import token_policy
+
+    (row,) = real_size.chosen(("policy-openvla-7b-tokens",))
+    make = lambda: token_policy(lora_rank=32, gradient_checkpointing=True)  # noqa: E731
+    small = dataclasses.replace(row, make=make, call_batches=(2,))
+    counted = costs(small)
+    with torch.device("meta"):
+        policy = make()
+    layers = [*policy.backbone.language_model.layers.parameters(), policy.action_head.weight]
+    again = (policy.chunk_length * 7 - 1) * sum(each.numel() * each.element_size() for each in layers)
+    read = counted.calls[0].read_bytes - again
+    assert 0.8 * counted.weight_bytes < read <= counted.weight_bytes
+    assert counted.training.flops / 4 > 1.5 * counted.calls[0].flops / 2  # forward, again and backward, of a row

@@ -51,7 +51,11 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"num_threads": 0}, "num_threads must be at least 1"),
         ({"demonstrate": Demonstrate(episodes_per_task=0)}, "demonstrate.episodes_per_task must be at least 1"),
         ({"explore": Explore(scale_factors=())}, "explore.scale_factors"),
-        ({"post_train": PostTrain(ratio_level="foo")}, "ratio_level must be one of step, chunk, got 'foo'"),
+        (
+            {"post_train": PostTrain(ratio_level="token")},
+            "ratio_level must be step or chunk for OFTPolicy, which does not",
+        ),
+        ({"post_train": PostTrain(ratio_level="foo")}, "ratio_level must be one of step, chunk, token, got 'foo'"),
         ({"post_train": PostTrain(contexts="hard")}, "contexts must be one of uniform, mixed, got 'hard'"),
         ({"post_train": PostTrain(group_size=1)}, "group_size must be at least 2"),
         ({"seed": -1}, "seed must be a whole number of at least 0, got -1"),

@@ -52,7 +52,8 @@ class LOOPLoss(LossModule):
         clip_epsilon: ``epsilon``, or ``(low, high)``.
         ratio_level: ``step`` (the paper); ``chunk``: one ratio for the executed steps of a chunk, counted once for each
             of them; ``dim``: one for each action dimension, averaged (needs log-probs [*B, C, 7], ``event_dims=0``);
-            ``token``: the same for a :class:`~worldenv_trl.policies.TokenActor`, whose tokens are the action:
+            ``token``: the same for a :class:`~worldenv_trl.policies.TokenActor` or
+            :class:`~worldenv_trl.policies.AutoregressiveActor`, whose tokens are the action:
             ``set_keys(action=keys.TOKENS)``.
         normalize: ``global`` (the paper) weighs every step equally, ``episode`` every rollout. The latter reads
             ``total_steps`` and the number of rollouts ``num_rollouts`` [*B, 1], or counts both if decisions are
@@ -208,6 +209,7 @@ class LOOPLoss(LossModule):
 
         # Actions that were not executed must not reach the graph: 0 * NaN is NaN, also backwards.
         chunk = torch.where(steps.unsqueeze(-1), chunk, torch.zeros_like(chunk))  # tokens stay whole numbers
+        tensordict.set(names.action, chunk)  # an autoregressive actor reads them
         now = self._distribution(tensordict).log_prob(chunk)
         if now.shape != before.shape:
             raise ValueError(

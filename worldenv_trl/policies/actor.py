@@ -13,10 +13,12 @@ from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor
 
 from worldenv_trl.keys import CHUNK, LOC, LOG_PROBS, LOG_SCALE, SCALE
+from worldenv_trl.policies.autoregressive import AutoregressiveActor
 from worldenv_trl.policies.base import Policy
 from worldenv_trl.policies.laplace import IndependentLaplace
+from worldenv_trl.policies.token_policy import TokenPolicy
 
-__all__ = ["LaplaceActor", "laplace_actor", "likelihood_actor", "scale_bounds"]
+__all__ = ["LaplaceActor", "laplace_actor", "likelihood_actor", "policy_actor", "scale_bounds"]
 
 Bound = float | Sequence[float]
 
@@ -137,7 +139,7 @@ def laplace_actor(
             use :func:`likelihood_actor`.
 
     Raises:
-        TypeError: for what is not a policy.
+        TypeError: for what is not a policy, and for one that acts by tokens: see :func:`policy_actor`.
         ValueError: for bounds of which the lower one is not below the upper one, or a factor that is not positive.
 
     Examples:
@@ -152,6 +154,8 @@ def laplace_actor(
     """
     if not isinstance(policy, Policy):
         raise TypeError(f"policy must be a worldenv_trl.policies.Policy, got {type(policy).__name__}")
+    if isinstance(policy, TokenPolicy):
+        raise TypeError(f"{type(policy).__name__} acts by tokens and has no Laplace density: use policy_actor")
     scale_factor = _positive(scale_factor)
     bounds = None
     if log_scale_bounds is not None:
@@ -172,6 +176,35 @@ def laplace_actor(
         return_log_prob=True,
         log_prob_key=LOG_PROBS,
     )
+
+
+def policy_actor(
+    policy: Policy,
+    *,
+    scale_factor: float = 1.0,
+    log_scale_bounds: tuple[Bound, Bound] | None = (-6.0, -1.5),
+    event_dims: int = 1,
+) -> LaplaceActor | AutoregressiveActor:
+    """The stochastic actor of any policy: :func:`laplace_actor`, or :class:`AutoregressiveActor` of one that acts by
+    tokens.
+
+    Args:
+        policy: a :class:`~worldenv_trl.policies.Policy`.
+
+    Keyword Args:
+        scale_factor: exploration width relative to the policy's own, positive: of the Laplace scale, or of the
+            temperature.
+        log_scale_bounds: of the Laplace scale; without meaning for tokens.
+        event_dims: of the log-probabilities, see both.
+
+    Raises:
+        TypeError: for what is not a policy.
+        ValueError: see both.
+    """
+    if isinstance(policy, TokenPolicy):
+        temperature = policy.temperature * _positive(scale_factor)
+        return AutoregressiveActor(policy, temperature=temperature, event_dims=event_dims)
+    return laplace_actor(policy, event_dims=event_dims, scale_factor=scale_factor, log_scale_bounds=log_scale_bounds)
 
 
 def likelihood_actor(policy: Policy) -> LaplaceActor:

@@ -114,16 +114,25 @@ class Policy(TensorDictModuleBase, abc.ABC):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        batch, observed = self.observed(tensordict)
+        loc, log_scale = self.predict(*observed)
+        shape = (*batch, self.chunk_length, ACTION_DIM)
+        tensordict.set(LOC, loc.float().reshape(shape))
+        return tensordict.set(LOG_SCALE, log_scale.float().reshape(shape))
+
+    def observed(self, tensordict: TensorDictBase) -> tuple[torch.Size, tuple[dict[str, Tensor], Tensor, list[str]]]:
+        """The batch size of a TensorDict [*B], and what :meth:`predict` takes of it, rows flattened.
+
+        Raises:
+            ValueError: for an image or a goal that is missing, and images or states of another size.
+        """
         state = tensordict[STATE]
         batch = state.shape[:-1]  # dispatched entries come without a batch size
         if state.shape[-1] != STATE_DIM:
             raise ValueError(f"{STATE} must be [*B, {STATE_DIM}], got {list(state.shape)}")
         images = {camera: self._image(tensordict, camera, batch) for camera in self.cameras}
         instructions = self._goals(tensordict, batch.numel())
-        loc, log_scale = self.predict(images, state.reshape(-1, STATE_DIM), instructions)
-        shape = (*batch, self.chunk_length, ACTION_DIM)
-        tensordict.set(LOC, loc.float().reshape(shape))
-        return tensordict.set(LOG_SCALE, log_scale.float().reshape(shape))
+        return batch, (images, state.reshape(-1, STATE_DIM), instructions)
 
     @torch.compiler.disable  # texts are no tensors: a compiled graph would be made anew for each mixture of them
     def _goals(self, tensordict: TensorDictBase, rows: int) -> list[str]:

@@ -131,40 +131,60 @@ class VisionLanguageBackbone(nn.Module):
             valid: which of them are no padding, bool [n, L].
             placeholders: how many.
         """
-        rows, cameras = pixels.shape[:2]
         embed = self.language_model.get_input_embeddings()
-        features = self.image_features(pixels.flatten(0, 1)).unflatten(0, (rows, cameras))  # [n, cameras, T, dim]
-
-        def tokens(values: Sequence[int]) -> Tensor:
-            return embed(torch.tensor([values], device=ids.device)).expand(rows, -1, -1)
-
-        first = [] if self.first_id is None else [tokens([self.first_id])]
-        images: list[Tensor] = []
-        for camera in range(cameras):
-            images += [tokens(self._around[0])] if self._around[0] else []
-            images.append(features[:, camera])
-            images += [tokens(self._around[1])] if self._around[1] else []
-        dtype = features.dtype
-        front = [*images, proprio[:, None].to(dtype)]
-        front = [*front, *first] if self.family.images_first else [*first, *front]
+        front, sides = self._front(pixels, ids.device, proprio)
+        rows, dtype = pixels.shape[0], front[sides[0]].dtype
         back = [torch.zeros(rows, placeholders, self.dim, dtype=dtype, device=ids.device)]
         if self.stop_id is not None:
-            back.append(tokens([self.stop_id]))
+            back.append(self._tokens([self.stop_id], rows, ids.device))
         sequence = torch.cat([*front, embed(ids), *back], 1).to(dtype)  # [n, S, dim]
 
-        ahead, behind = sum(part.shape[1] for part in front), sum(part.shape[1] for part in back)
-        seen = torch.nn.functional.pad(valid, (ahead, behind), value=True)  # [n, S]
-        mask = self._mask(seen, behind, dtype)
-        if self.family.grid_positions:
-            sides = [i for i, part in enumerate(front) if any(part is image for image in images)]
-            positions = self._grid_positions(seen, [part.shape[1] for part in front], sides, features.shape[2])
-        else:
-            positions = (seen.cumsum(1) - 1).clamp(min=0) + self.family.first_position
+        behind = sum(part.shape[1] for part in back)
+        seen = self._seen(valid, front, behind)
+        mask = self._additive(self._allowed(seen, behind), dtype)
         hidden = self.language_model(
-            inputs_embeds=sequence, attention_mask=mask, position_ids=positions, use_cache=False
+            inputs_embeds=sequence,
+            attention_mask=mask,
+            position_ids=self._positions(seen, front, sides),
+            use_cache=False,
         ).last_hidden_state
         begin = sequence.shape[1] - behind - self.readout_shift
         return hidden[:, begin : begin + placeholders]
+
+    def _front(
+        self, pixels: Tensor, device: torch.device, proprio: Tensor | None = None
+    ) -> tuple[list[Tensor], list[int]]:
+        """What stands before the text, [n, length, dim] each, and which of it are images."""
+        rows, cameras = pixels.shape[:2]
+        features = self.image_features(pixels.flatten(0, 1)).unflatten(0, (rows, cameras))  # [n, cameras, T, dim]
+        first = [] if self.first_id is None else [self._tokens([self.first_id], rows, device)]
+        front: list[Tensor] = []
+        sides: list[int] = []
+        for camera in range(cameras):
+            front += [self._tokens(self._around[0], rows, device)] if self._around[0] else []
+            sides.append(len(front))
+            front.append(features[:, camera])
+            front += [self._tokens(self._around[1], rows, device)] if self._around[1] else []
+        front += [] if proprio is None else [proprio[:, None].to(features.dtype)]
+        if self.family.images_first:
+            return [*front, *first], sides
+        return [*first, *front], [side + len(first) for side in sides]
+
+    def _tokens(self, values: Sequence[int], rows: int, device: torch.device) -> Tensor:
+        embed = self.language_model.get_input_embeddings()
+        return embed(torch.tensor([values], device=device)).expand(rows, -1, -1)
+
+    @staticmethod
+    def _seen(valid: Tensor, front: Sequence[Tensor], behind: int) -> Tensor:
+        """Which tokens of the sequence are no padding, bool [n, S]."""
+        ahead = sum(part.shape[1] for part in front)
+        return torch.nn.functional.pad(valid, (ahead, behind), value=True)
+
+    def _positions(self, seen: Tensor, front: Sequence[Tensor], sides: Sequence[int]) -> Tensor:
+        """[n, S], or [3, n, S] where images have rows and columns."""
+        if self.family.grid_positions:
+            return self._grid_positions(seen, [part.shape[1] for part in front], sides, front[sides[0]].shape[1])
+        return (seen.cumsum(1) - 1).clamp(min=0) + self.family.first_position
 
     def image_features(self, pixels: Tensor) -> Tensor:
         """What the language model sees of prepared images [n, 3, H, W]: [n, T, dim]."""
@@ -191,8 +211,8 @@ class VisionLanguageBackbone(nn.Module):
         embedded = patches + vision.embeddings.position_embedding(where)
         return vision.post_layernorm(vision.encoder(inputs_embeds=embedded, attention_mask=None).last_hidden_state)
 
-    def _mask(self, seen: Tensor, behind: int, dtype: torch.dtype) -> Any:
-        """Additive [n, 1, S, S]: padding is never seen, placeholders by the text only where attention is ``full``."""
+    def _allowed(self, seen: Tensor, behind: int) -> Tensor:
+        """Bool [n, S, S]: padding is never seen, placeholders by the text only where attention is ``full``."""
         length = seen.shape[1]
         allowed = seen[:, None, :].expand(-1, length, -1)
         if self.attention == "prefix":
@@ -201,8 +221,11 @@ class VisionLanguageBackbone(nn.Module):
             within = ~block[None, :] if self.family.prefix_sees_itself else index[None, :] <= index[:, None]
             allowed = allowed & (block[:, None] | within)
         # A row of padding must see something, or its softmax is not a number.
-        allowed = allowed | torch.eye(length, dtype=torch.bool, device=seen.device)
-        mask = torch.zeros((), dtype=dtype, device=seen.device)
+        return allowed | torch.eye(length, dtype=torch.bool, device=seen.device)
+
+    def _additive(self, allowed: Tensor, dtype: torch.dtype) -> Any:
+        """What the language model adds, [n, 1, queries, keys]; by kind of its layers, where there are kinds."""
+        mask = torch.zeros((), dtype=dtype, device=allowed.device)
         mask = torch.where(allowed, mask, torch.finfo(dtype).min)[:, None]
         return {kind: mask for kind in self._kinds} if "sliding_attention" in self._kinds else mask
 
@@ -240,3 +263,10 @@ def autocast(device: torch.device, dtype: torch.dtype) -> contextlib.AbstractCon
     if dtype == torch.float32 or not torch.amp.is_autocast_available(device.type):
         return contextlib.nullcontext()
     return torch.autocast(device.type, dtype=dtype)
+
+
+def full_precision(device: torch.device) -> contextlib.AbstractContextManager:
+    """Products as precise as what they are of, inside :func:`autocast`."""
+    if not torch.amp.is_autocast_available(device.type):
+        return contextlib.nullcontext()
+    return torch.autocast(device.type, enabled=False)

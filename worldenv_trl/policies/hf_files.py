@@ -45,7 +45,7 @@ def check_kind(fields: dict[str, Any], folder: Path, wanted: str) -> None:
     elif "model_type" not in fields and {"type", "input_features"} & set(fields):
         found, reader = f"a LeRobot policy of type {fields.get('type')!r}", "LeRobot alone: it runs there, not here"
     elif fields.get("model_type") == "openvla" and wanted != "openvla":
-        found, reader = "an OpenVLA checkpoint", "load_openvla_oft"
+        found, reader = "an OpenVLA checkpoint", "load_openvla_oft, or load_openvla where it acts by tokens"
     elif fields.get("model_type") != "openvla" and wanted == "openvla":
         found, reader = f"a model of type {fields.get('model_type')!r}", "HFPolicy.from_backbone"
     else:
@@ -56,7 +56,8 @@ def check_kind(fields: dict[str, Any], folder: Path, wanted: str) -> None:
 def read_backbone(
     folder: str | os.PathLike, dtype: torch.dtype, device: str | torch.device
 ) -> tuple[dict[str, Any], Tokenizer, PreTrainedModel]:
-    """What :meth:`HFPolicy.from_backbone` needs of a folder: fields of its config, tokenizer and backbone.
+    """What ``from_backbone`` needs of a folder: fields of its config, tokenizer and the whole model, with its language
+    head.
 
     On the device ``meta`` no weights are read.
 
@@ -66,7 +67,7 @@ def read_backbone(
     """
     from transformers import AutoModelForImageTextToText
 
-    from worldenv_trl.policies.hf_backbone import backbone_config, make_model
+    from worldenv_trl.policies.hf_backbone import backbone_config
 
     folder = local_folder(folder)
     described = read_json(folder, "config.json")
@@ -80,8 +81,8 @@ def read_backbone(
     tokenizer = read_tokenizer(folder)
     with torch.device(device):
         if torch.device(device).type == "meta":
-            return fields, tokenizer, make_model(config, dtype)
-        model = AutoModelForImageTextToText.from_pretrained(folder, dtype=dtype, local_files_only=True).model
+            return fields, tokenizer, AutoModelForImageTextToText.from_config(config, dtype=dtype)
+        model = AutoModelForImageTextToText.from_pretrained(folder, dtype=dtype, local_files_only=True)
     return fields, tokenizer, model
 
 

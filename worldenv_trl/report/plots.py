@@ -48,7 +48,7 @@ def _losses(lines: list[dict[str, Any]]) -> Any:
     wanted = [
         (stage, key)
         for stage in dict.fromkeys(line["stage"] for line in lines)
-        for key in ("l1", "nll", "loss", "encoder_loss")
+        for key in ("l1", "nll", "cross_entropy", "loss", "encoder_loss")
     ]
     found = [(stage, key, *_series(lines, stage, key)) for stage, key in wanted]
     found = [item for item in found if item[2]]

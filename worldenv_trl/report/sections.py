@@ -71,8 +71,9 @@ def learning(record: RunRecord) -> str:
         ))
         for stage in record.stages("")
         for key, name in (
-            ("l1", "L1 of the action chunk"), ("nll", "Laplace NLL of the scale head"), ("loss", "loss"),
-            ("encoder_loss", "encoder loss"), ("kl_approx", "KL per step"), ("clip_fraction", "clipped ratios"),
+            ("l1", "L1 of the action chunk"), ("nll", "Laplace NLL of the scale head"),
+            ("cross_entropy", "cross-entropy of the action tokens"), ("loss", "loss"), ("encoder_loss", "encoder loss"),
+            ("kl_approx", "KL per step"), ("clip_fraction", "clipped ratios"),
         )
         if len(record.series(stage, key)[0]) > 1
     ]  # fmt: skip
