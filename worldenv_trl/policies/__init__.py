@@ -1,13 +1,15 @@
 """Policies: the interface, the Laplace distribution and actor, the compact OFT policy, policies over
-Hugging Face vision-language models and behind servers, image augmentation."""
+Hugging Face vision-language models and behind servers, LeRobot's flow-matching policies, image augmentation."""
 
 from worldenv_trl.policies.actor import LaplaceActor, laplace_actor, likelihood_actor, scale_bounds
 from worldenv_trl.policies.augmentation import random_shift
 from worldenv_trl.policies.base import Policy
 from worldenv_trl.policies.device_bridge import DeviceBridge
 from worldenv_trl.policies.external import ExternalConfig, ExternalPolicy
+from worldenv_trl.policies.flow import FlowConfig, FlowPolicy
 from worldenv_trl.policies.hf import HFConfig, HFPolicy
 from worldenv_trl.policies.laplace import IndependentLaplace
+from worldenv_trl.policies.lerobot import load_lerobot
 from worldenv_trl.policies.oft import OFTConfig, OFTPolicy
 from worldenv_trl.policies.openvla_oft import load_openvla_oft
 from worldenv_trl.policies.pairing import check_pairing
@@ -18,6 +20,8 @@ __all__ = [
     "DeviceBridge",
     "ExternalConfig",
     "ExternalPolicy",
+    "FlowConfig",
+    "FlowPolicy",
     "HFConfig",
     "HFPolicy",
     "IndependentCategorical",
@@ -31,6 +35,7 @@ __all__ = [
     "check_pairing",
     "laplace_actor",
     "likelihood_actor",
+    "load_lerobot",
     "load_openvla_oft",
     "random_shift",
     "scale_bounds",

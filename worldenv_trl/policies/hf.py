@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from worldenv_trl.keys import ACTION_DIM, CHUNK_LENGTH, STATE_DIM
+from worldenv_trl.policies.adapters import inject_adapters
 from worldenv_trl.policies.base import Policy, check_rank
 from worldenv_trl.policies.heads import MLPResNet
 from worldenv_trl.policies.hf_backbone import (
@@ -26,6 +27,7 @@ from worldenv_trl.policies.hf_backbone import (
     make_model,
 )
 from worldenv_trl.policies.images import prepare_images
+from worldenv_trl.policies.proprio import libero_proprio
 from worldenv_trl.pretrained import Pretrained
 
 if TYPE_CHECKING:
@@ -35,7 +37,6 @@ if TYPE_CHECKING:
 __all__ = ["HFConfig", "HFPolicy"]
 
 TOKENIZER_NAME = "tokenizer.json"
-FINGER_TRAVEL = 0.04  # metres, of each of the Panda's fingers in LIBERO, from closed to open
 PROMPT = "In: What action should the robot take to {instruction}?\nOut:"
 
 
@@ -274,10 +275,7 @@ class HFPolicy(Policy, Pretrained):
         self.action_range.copy_(action_half)
 
     def _proprio(self, state: Tensor) -> Tensor:
-        if self.config.proprio_format == "state":
-            return state
-        finger = FINGER_TRAVEL * state[..., -1:]
-        return torch.cat([state[..., :-1], finger, -finger], -1)
+        return state if self.config.proprio_format == "state" else libero_proprio(state)
 
     def scale_parameters(self) -> list[nn.Parameter]:
         return list(self.scale_head.parameters())
@@ -313,28 +311,7 @@ class HFPolicy(Policy, Pretrained):
             return cls(config, Tokenizer.from_file(str(folder / TOKENIZER_NAME)))
 
     def _inject_adapters(self) -> None:
-        import peft  # imported where used: it takes seconds
-
-        rank, model = self.config.lora_rank, self.backbone.model
-        kinds = nn.modules.linear.NonDynamicallyQuantizableLinear  # of nn.MultiheadAttention, which calls no module
-        targets = [
-            name
-            for name, module in model.named_modules()
-            if isinstance(module, nn.Linear) and not isinstance(module, kinds)
-        ]
-        alpha = self.config.lora_alpha or min(rank, 16)
-        lora = peft.LoraConfig(r=rank, lora_alpha=alpha, target_modules=targets)
-        model.requires_grad_(False)
-        peft.inject_adapter_in_model(lora, model)
-        device = next(model.parameters()).device
-        for name, parameter in model.named_parameters():
-            if "lora_" in name:  # small steps are lost in bfloat16
-                parameter.data = parameter.data.to(device, torch.float32)
-                parameter.requires_grad_(True)
-        if torch.amp.is_autocast_available(device.type):
-            for module in model.modules():
-                if hasattr(module, "lora_A"):  # the autocast does what peft would do by a copy in float32
-                    module.cast_input_dtype_enabled = self._dtype == torch.float32
+        inject_adapters(self.backbone.model, self.config.lora_rank, self.config.lora_alpha, self._dtype)
 
     def _token_id(self, text: str) -> int:
         number = self.tokenizer.token_to_id(text)

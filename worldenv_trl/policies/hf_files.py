@@ -35,7 +35,7 @@ def check_kind(fields: dict[str, Any], folder: Path, wanted: str) -> None:
     Args:
         fields: of ``config.json``.
         folder: where it is.
-        wanted: ``backbone``, transformers' own, or ``openvla``.
+        wanted: ``backbone``, transformers' own, ``openvla`` or ``lerobot``.
 
     Raises:
         ValueError: for another kind.
@@ -43,10 +43,12 @@ def check_kind(fields: dict[str, Any], folder: Path, wanted: str) -> None:
     if "class" in fields and "config" in fields:
         found, reader = f"a {fields['class']} of worldenv_trl", f"{fields['class']}.from_pretrained"
     elif "model_type" not in fields and {"type", "input_features"} & set(fields):
-        found, reader = f"a LeRobot policy of type {fields.get('type')!r}", "LeRobot alone: it runs there, not here"
+        if wanted == "lerobot":
+            return
+        found, reader = f"a LeRobot policy of type {fields.get('type')!r}", "load_lerobot"
     elif fields.get("model_type") == "openvla" and wanted != "openvla":
         found, reader = "an OpenVLA checkpoint", "load_openvla_oft"
-    elif fields.get("model_type") != "openvla" and wanted == "openvla":
+    elif fields.get("model_type") != "openvla" and wanted != "backbone":
         found, reader = f"a model of type {fields.get('model_type')!r}", "HFPolicy.from_backbone"
     else:
         return

@@ -1,0 +1,39 @@
+"""LoRA adapters (peft) on the linear layers of a pretrained network."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+__all__ = ["inject_adapters"]
+
+
+def inject_adapters(network: nn.Module, rank: int, alpha: int, dtype: torch.dtype) -> None:
+    """Puts adapters on every linear layer of a network, in place, and freezes the rest of it.
+
+    Args:
+        network: what is adapted.
+        rank: of the adapters.
+        alpha: their gain times the rank; at most 16 and no more than the rank when 0, as in OpenVLA-OFT.
+        dtype: of the network's weights; adapters are float32.
+    """
+    import peft  # imported where used: it takes seconds
+
+    kinds = nn.modules.linear.NonDynamicallyQuantizableLinear  # of nn.MultiheadAttention, which calls no module
+    targets = [
+        name
+        for name, module in network.named_modules()
+        if isinstance(module, nn.Linear) and not isinstance(module, kinds)
+    ]
+    lora = peft.LoraConfig(r=rank, lora_alpha=alpha or min(rank, 16), target_modules=targets)
+    network.requires_grad_(False)
+    peft.inject_adapter_in_model(lora, network)
+    device = next(network.parameters()).device
+    for name, parameter in network.named_parameters():
+        if "lora_" in name:  # small steps are lost in bfloat16
+            parameter.data = parameter.data.to(device, torch.float32)
+            parameter.requires_grad_(True)
+    if torch.amp.is_autocast_available(device.type):
+        for module in network.modules():
+            if hasattr(module, "lora_A"):  # the autocast does what peft would do by a copy in float32
+                module.cast_input_dtype_enabled = dtype == torch.float32
