@@ -10,7 +10,7 @@ import torch
 
 from config import WorldEnvConfig
 from parts import COMPACT, PROPRIO, Part, Parts, instructions
-from worldenv_trl.policies import HFPolicy, Policy, load_openvla_oft
+from worldenv_trl.policies import FlowPolicy, HFPolicy, Policy, load_lerobot, load_openvla_oft
 from worldenv_trl.policies.hf_files import check_weights, read_json
 from worldenv_trl.reflectors import Reflector, VLMReflector, VLMReflectorConfig
 from worldenv_trl.reflectors.video_language_model import VideoLanguageModel
@@ -31,8 +31,9 @@ def parts_of(config: WorldEnvConfig) -> Parts:
     return REAL_SIZE if config.parts == "real-size" else COMPACT
 
 
-def make_policy(config: WorldEnvConfig, device: str = "cpu") -> HFPolicy:
-    """OpenVLA-OFT's checkpoint, or its recipe over a vision-language model.
+def make_policy(config: WorldEnvConfig, device: str = "cpu") -> Policy:
+    """OpenVLA-OFT's checkpoint, LeRobot's of a flow-matching policy, or OpenVLA-OFT's recipe over a vision-language
+    model.
 
     Raises:
         FileNotFoundError: if the folder lacks a file.
@@ -40,7 +41,12 @@ def make_policy(config: WorldEnvConfig, device: str = "cpu") -> HFPolicy:
     """
     folder = _named(config, "policy")
     settings = policy_settings(config)
-    if read_json(folder, "config.json").get("model_type") != "openvla":
+    described = read_json(folder, "config.json")
+    if "input_features" in described:
+        chosen = config.real_size
+        settings |= {"backbone": chosen.backbone or None, "mirror": chosen.mirror, "chunk_length": config.chunk_length}
+        return load_lerobot(folder, device=device, **settings)
+    if described.get("model_type") != "openvla":
         return HFPolicy.from_backbone(folder, device=device, chunk_length=config.chunk_length, **settings)
     if (config.sft.cameras and len(config.sft.cameras) != 2) or len(config.cameras) != 2:
         raise ValueError(
@@ -50,8 +56,14 @@ def make_policy(config: WorldEnvConfig, device: str = "cpu") -> HFPolicy:
     return load_openvla_oft(folder, statistics=config.real_size.statistics or None, device=device, **settings)
 
 
+def load_policy(folder: Path) -> Policy:
+    """What ``save_pretrained`` of a policy of :func:`make_policy` wrote."""
+    flows = read_json(folder, "config.json").get("class") == FlowPolicy.__name__
+    return (FlowPolicy if flows else HFPolicy).from_pretrained(folder)
+
+
 def policy_settings(config: WorldEnvConfig) -> dict[str, Any]:
-    """Fields of :class:`~worldenv_trl.policies.HFConfig` that the run decides."""
+    """Fields of :class:`~worldenv_trl.policies.HFConfig`, or ``FlowConfig``, that the run decides."""
     return {
         "instructions": instructions(config),
         "cameras": config.sft.cameras or config.cameras,
@@ -137,7 +149,7 @@ def _named(config: WorldEnvConfig, part: str) -> Path:
 
 
 REAL_SIZE = Parts(
-    policy=Part[Policy](make_policy, HFPolicy.from_pretrained, partial(make_policy, device="meta")),
+    policy=Part[Policy](make_policy, load_policy, partial(make_policy, device="meta")),
     world_model=Part[WorldModel](
         make_world_model, DiffusionWorldModel.from_pretrained, partial(make_world_model, device="meta")
     ),

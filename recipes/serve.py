@@ -17,8 +17,9 @@ import tyro
 from command_line import one_line_errors
 from threads import use_threads
 from worldenv_trl.devices import choose_device
-from worldenv_trl.policies import HFPolicy, OFTPolicy, Policy, ServedPolicy, load_openvla_oft
+from worldenv_trl.policies import FlowPolicy, HFPolicy, OFTPolicy, Policy, ServedPolicy, load_lerobot, load_openvla_oft
 from worldenv_trl.policies.bridge import serve
+from worldenv_trl.policies.hf_files import read_json
 from worldenv_trl.pretrained import OtherClassError
 from worldenv_trl.record import model_hash
 
@@ -26,7 +27,7 @@ from worldenv_trl.record import model_hash
 @dataclass(frozen=True)
 class Settings:
     checkpoint: tyro.conf.Positional[str]
-    """Folder or Hub id of an OFTPolicy or HFPolicy, or folder of an OpenVLA-OFT release."""
+    """Folder or Hub id of an OFTPolicy, HFPolicy or FlowPolicy, or folder of an OpenVLA-OFT release or of LeRobot."""
     address: str = "127.0.0.1:8765"
     """``host:port``, port 0 for any free one, or ``unix:/path``. It answers whoever reaches it."""
     device: str = "auto"
@@ -52,10 +53,15 @@ def load_policy(checkpoint: str, device: torch.device) -> Policy:
     """
     if (Path(checkpoint) / "dataset_statistics.json").exists():
         return load_openvla_oft(checkpoint, device=device)
-    try:
-        return OFTPolicy.from_pretrained(checkpoint, device=device)
-    except OtherClassError:
-        return HFPolicy.from_pretrained(checkpoint, device=device)
+    config = Path(checkpoint) / "config.json"
+    if config.is_file() and "input_features" in read_json(config.parent, config.name):
+        return load_lerobot(checkpoint, device=device)
+    for kind in (OFTPolicy, HFPolicy):
+        try:
+            return kind.from_pretrained(checkpoint, device=device)
+        except OtherClassError:
+            continue
+    return FlowPolicy.from_pretrained(checkpoint, device=device)
 
 
 if __name__ == "__main__":

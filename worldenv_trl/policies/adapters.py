@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import nn
 
@@ -34,6 +36,6 @@ def inject_adapters(network: nn.Module, rank: int, alpha: int, dtype: torch.dtyp
             parameter.data = parameter.data.to(device, torch.float32)
             parameter.requires_grad_(True)
     if torch.amp.is_autocast_available(device.type):
-        for module in network.modules():
-            if hasattr(module, "lora_A"):  # the autocast does what peft would do by a copy in float32
-                module.cast_input_dtype_enabled = dtype == torch.float32
+        adapted: list[Any] = [module for module in network.modules() if hasattr(module, "lora_A")]
+        for module in adapted:  # the autocast does what peft would do by a copy in float32
+            module.cast_input_dtype_enabled = dtype == torch.float32

@@ -38,7 +38,7 @@ class FlowConfig:
 
     Args:
         kind: of :data:`~worldenv_trl.policies.flow_network.FLOW_FAMILIES`: ``smolvla``, ``pi0`` or ``pi05``.
-        backbone: ``to_dict()`` of the transformers config of the vision-language model; its layers are those that are used.
+        backbone: ``to_dict()`` of the transformers config of the vision-language model, with the layers that are used.
         expert: ``hidden_size``, ``intermediate_size`` and ``num_hidden_layers`` of the action expert.
         instructions: those it is trained on; others are answered with a warning. Empty: it never warns.
         cameras: scene cameras it looks through, in the order of training.

@@ -223,8 +223,7 @@ class FlowNetwork(nn.Module):
 
     def velocity(self, hidden: Tensor) -> Tensor:
         """What hidden states [n, H, width] say of the way from actions to noise, float32 [n, H, max_action_dim]."""
-        with torch.autocast(hidden.device.type, enabled=False):
-            return self.action_out_proj(hidden.float())
+        return self.action_out_proj(hidden.float())
 
     def _hidden(self, prefix: Prefix, state: Tensor, actions: Tensor, time: float) -> Tensor:
         rows, steps = actions.shape[:2]
@@ -247,7 +246,8 @@ class FlowNetwork(nn.Module):
         allowed = torch.cat([outside, block.expand(rows, -1, -1)], 2)
         order = torch.arange(count, device=actions.device).expand(rows, -1)
         positions = prefix.seen.sum(1, keepdim=True) + order
-        hidden = tokens
+        dtype = prefix.layers[0][0].dtype
+        hidden, condition = tokens.to(dtype), None if condition is None else condition.to(dtype)
         for layer, past in zip(self.expert.layers, prefix.layers[:: self.expert.stride], strict=True):
             crossing = layer.mode == "cross"
             hidden, _, _ = layer(

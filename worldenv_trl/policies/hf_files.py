@@ -124,14 +124,14 @@ def read_tokenizer(folder: Path) -> Tokenizer:
     return Tokenizer.from_file(str(path))
 
 
-def check_weights(folder: Path) -> list[Path]:
-    """The safetensors files of a folder.
+def check_weights(folder: Path, pattern: str = "*.safetensors") -> list[Path]:
+    """The safetensors files of a folder, those whose names are like ``pattern``.
 
     Raises:
         FileNotFoundError: if there are no weights, or a file is missing that their index lists.
         ValueError: if they are pickled: reading them could run any code; the command that converts them is said.
     """
-    found = sorted(folder.glob("*.safetensors"))
+    found = sorted(folder.glob(pattern))
     index = folder / "model.safetensors.index.json"
     if index.is_file():
         listed = sorted(set(read_json(folder, index.name).get("weight_map", {}).values()))
@@ -146,7 +146,7 @@ def check_weights(folder: Path) -> list[Path]:
             f"{folder} holds its weights as pickles alone ({pickled[0]}), which can run any code when read. If you "
             "trust where they are from, convert them once: " + convert_command(folder / pickled[0])
         )
-    raise FileNotFoundError(f"{folder} holds no weights: *.safetensors is missing")
+    raise FileNotFoundError(f"{folder} holds no weights: {pattern} is missing")
 
 
 def convert_command(path: Path) -> str:

@@ -90,9 +90,8 @@ class JointLayer(nn.Module):
         seen = keys, values
         if past is not None and self.mode == "self":
             seen = torch.cat([past[0], keys], 2), torch.cat([past[1], values], 2)
-        attended = F.scaled_dot_product_attention(
-            queries, *(each.to(queries.dtype) for each in seen), attn_mask=allowed[:, None], enable_gqa=True
-        )
+        first, second = (each.to(queries.dtype) for each in seen)
+        attended = F.scaled_dot_product_attention(queries, first, second, attn_mask=allowed[:, None], enable_gqa=True)
         hidden = hidden + attention.o_proj(attended.transpose(1, 2).flatten(2)) * gate
         normed, gate = _normed(self.post_attention_layernorm, hidden, condition)
         return hidden + self.mlp(normed) * gate, keys, values

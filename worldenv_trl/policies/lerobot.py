@@ -113,6 +113,8 @@ def _check(read: LeRobotFolder, cameras: Sequence[str], image_features: Sequence
     for option in _UNKNOWN:
         if read.fields.get(option):
             raise ValueError(f"{read.folder} was trained with {option}, which is not known: LeRobot alone runs it")
+    if read.fields.get("add_image_special_tokens") and read.fields.get("empty_cameras"):
+        raise ValueError(f"{read.folder} puts tokens around images of cameras that are not there: this is not known")
     if read.fields.get("n_obs_steps", 1) != 1:
         raise ValueError(f"{read.folder} looks at {read.fields['n_obs_steps']} observations: only 1 is known")
     for name, features in ((STATE, read.inputs), (ACTION, read.outputs)):
@@ -227,7 +229,7 @@ def _backbone(read: LeRobotFolder, named: str | os.PathLike | None) -> tuple[Tok
     places = [Path(named)] if named else [read.folder, read.folder / "tokenizer"]
     own = next((place for place in places if (place / "tokenizer.json").is_file()), None)
     files = ["config.json"] * smolvla + ["tokenizer.json"] * (own is None)
-    if not files:
+    if own is not None and not files:
         return read_tokenizer(own), {}
     name = named or (read.fields.get("vlm_model_name", "") if smolvla else PALIGEMMA)
     try:

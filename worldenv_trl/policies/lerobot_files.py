@@ -161,6 +161,7 @@ def read_lerobot_folder(folder: str | os.PathLike, known: Sequence[str]) -> LeRo
             f"{folder} holds a LeRobot policy of type {fields.get('type')!r}, known are {', '.join(known)}: any other "
             "runs in LeRobot behind ExternalPolicy (worldenv_trl/policies/README.md)"
         )
+    weights = check_weights(folder, "model*.safetensors")
     inputs, outputs = (_features(fields, name, folder) for name in ("input_features", "output_features"))
     statistics, normalization = _of_steps(folder)
     normalization = (fields.get("normalization_mapping") or {}) | normalization
@@ -170,9 +171,6 @@ def read_lerobot_folder(folder: str | os.PathLike, known: Sequence[str]) -> LeRo
                 f"{folder / 'config.json'}: normalization_mapping must be of {', '.join(STATISTICS_OF)}, got "
                 f"{mode!r} for {kind}"
             )
-    weights = [path for path in check_weights(folder) if path.name.startswith("model")]
-    if not weights:
-        raise FileNotFoundError(f"{folder} holds no weights: model.safetensors is missing")
     statistics = statistics or _of_buffers(weights, (*inputs, *outputs))
     return LeRobotFolder(folder, fields["type"], fields, inputs, outputs, normalization, statistics, weights)
 
