@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import torch
-from policies.hf_models import backbone, tokenizer
+from policies.hf_models import backbone
+from policies.lerobot_folders import tokenizer
 from policies.observations import INSTRUCTIONS
 
 from worldenv_trl.policies import FlowConfig, FlowPolicy
 from worldenv_trl.policies.flow_network import FLOW_FAMILIES
 
 
-def flow_policy(kind: str = "smolvla", **settings) -> FlowPolicy:
+def flow_policy(kind: str = "smolvla", expert_layers: int = 2, **settings) -> FlowPolicy:
     torch.manual_seed(0)
     small = {
         "instructions": INSTRUCTIONS,
@@ -24,7 +25,8 @@ def flow_policy(kind: str = "smolvla", **settings) -> FlowPolicy:
         "self_every": 2 if kind == "smolvla" else 0,
         "lora_rank": 2,
         "head_dim": 48,
+        "max_tokens": 200,
     }
     network = backbone(FLOW_FAMILIES[kind].backbone).to_dict()
-    expert = {"hidden_size": 24, "intermediate_size": 40, "num_hidden_layers": 2}
-    return FlowPolicy(FlowConfig(kind, network, expert, **(small | settings)), tokenizer())
+    expert = {"hidden_size": 24, "intermediate_size": 40, "num_hidden_layers": expert_layers}
+    return FlowPolicy(FlowConfig(kind, network, expert, **(small | settings)), tokenizer(True))

@@ -250,7 +250,7 @@ LAYER = "model.vlm_with_expert.lm_expert.layers.1.mlp.up_proj.weight"
         (
             rewrite("config.json", resize_imgs_with_padding=[28, 14]),
             ValueError,
-            r"resizes images to \[28, 14\]: only sq",
+            r"resizes images to \[28, 14\]: only",
         ),
         (rewrite("config.json", add_image_special_tokens=True), ValueError, "tokens around images of cameras that"),
         (rewrite("config.json", vlm_model_name="none"), FileNotFoundError, "nor could none be read.*backbone= a fold"),
