@@ -30,6 +30,8 @@ class Settings:
     """Folder or Hub id of an OFTPolicy, HFPolicy or FlowPolicy, or folder of an OpenVLA-OFT release or of LeRobot."""
     address: str = "127.0.0.1:8765"
     """``host:port``, port 0 for any free one, or ``unix:/path``. It answers whoever reaches it."""
+    mirror: bool = False
+    """LeRobot's policy sees images with left and right swapped: those of LIBERO's data sets are mirrored."""
     device: str = "auto"
     """``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one."""
     num_threads: int = 1
@@ -38,14 +40,14 @@ class Settings:
 @one_line_errors
 def main(settings: Settings) -> None:
     use_threads(settings.num_threads)
-    policy = load_policy(settings.checkpoint, choose_device(settings.device))
+    policy = load_policy(settings.checkpoint, choose_device(settings.device), settings.mirror)
     name = Path(settings.checkpoint).name
     served = ServedPolicy(policy, name=f"{type(policy).__name__} {name}", digest=model_hash(policy))
     serve(served, served.description, settings.address)
 
 
-def load_policy(checkpoint: str, device: torch.device) -> Policy:
-    """A checkpoint of any of our policies.
+def load_policy(checkpoint: str, device: torch.device, mirror: bool = False) -> Policy:
+    """A checkpoint of any of our policies; ``mirror`` is a setting of LeRobot's alone.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -55,7 +57,7 @@ def load_policy(checkpoint: str, device: torch.device) -> Policy:
         return load_openvla_oft(checkpoint, device=device)
     config = Path(checkpoint) / "config.json"
     if config.is_file() and "input_features" in read_json(config.parent, config.name):
-        return load_lerobot(checkpoint, device=device)
+        return load_lerobot(checkpoint, device=device, mirror=mirror)
     for kind in (OFTPolicy, HFPolicy):
         try:
             return kind.from_pretrained(checkpoint, device=device)

@@ -243,7 +243,12 @@ LAYER = "model.vlm_with_expert.lm_expert.layers.1.mlp.up_proj.weight"
         (rewrite("config.json", type="act"), ValueError, "of type 'act', known are smolvla, pi0, pi05: any other runs"),
         (rewrite("config.json", model_type="openvla"), ValueError, "an OpenVLA checkpoint: what reads it is load_open"),
         (rewrite("config.json", input_features=3), ValueError, "input_features must hold a type and a shape"),
-        (rewrite("config.json", input_features={}), ValueError, r"looks through 0 cameras"),
+        (rewrite("config.json", input_features={}), ValueError, "has no feature observation.state: there are none"),
+        (
+            rewrite("config.json", input_features={"observation.state": {"type": "STATE", "shape": [8]}}),
+            ValueError,
+            "cameras must name at least one camera",
+        ),
         (rewrite("config.json", output_features={}), ValueError, "has no feature action"),
         (rewrite("config.json", adapt_to_pi_aloha=True), ValueError, "trained with adapt_to_pi_aloha"),
         (rewrite("config.json", n_obs_steps=2), ValueError, "looks at 2 observations: only 1 is known"),

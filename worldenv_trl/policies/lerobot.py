@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["load_lerobot"]
 
 STATE, ACTION = "observation.state", "action"
+CAMERAS = ("agentview", "wrist")
 PALIGEMMA = "google/paligemma-3b-pt-224"  # whose tokenizer pi0 and pi0.5 read with
 VISION_HEADS = 16  # of PaliGemma's SigLIP; shapes of weights do not tell
 # What other robots and other trainings switch on, and is not done here.
@@ -49,7 +50,7 @@ _UNUSED = re.compile(
 def load_lerobot(
     folder: str | os.PathLike,
     *,
-    cameras: Sequence[str] = ("agentview", "wrist"),
+    cameras: Sequence[str] | None = None,
     image_features: Sequence[str] | None = None,
     backbone: str | os.PathLike | None = None,
     device: str | torch.device = "cpu",
@@ -67,7 +68,8 @@ def load_lerobot(
             ``policy_postprocessor.json`` with their safetensors; or ``owner/name`` of a repository of the Hub.
 
     Keyword Args:
-        cameras: the scene's for each image feature, in order.
+        cameras: the scene's for each image feature, in order; ``agentview`` and ``wrist``, as many as there are, when
+            None.
         image_features: which of the policy's image features these are; all when None. A policy that was trained
             with a camera missing at times does without it.
         backbone: folder, or repository, of the vision-language model, of which ``tokenizer.json`` and, for SmolVLA,
@@ -83,24 +85,25 @@ def load_lerobot(
             statistic, features that are not this arm's, or weights that do not fit.
     """
     read = read_lerobot_folder(folder, tuple(FLOW_FAMILIES))
-    _check(read, cameras, image_features)
+    wanted = tuple(image_features or read.image_features)
+    cameras = CAMERAS[: len(wanted)] if cameras is None else tuple(cameras)
+    _check(read, cameras, wanted)
     tokenizer, described = _backbone(read, backbone)
     state = {} if torch.device(device).type == "meta" else dict(_renamed(read))
     fixed = bool(settings.get("fixed_statistics", True))
     shapes = {name: tuple(tensor.shape) for name, tensor in state.items()} or _shapes(read)
-    config = FlowConfig(**(_settings(read, shapes, described, fixed) | {"cameras": tuple(cameras)} | settings))
+    config = FlowConfig(**(_settings(read, shapes, described, fixed) | {"cameras": cameras} | settings))
     policy = FlowPolicy(config, tokenizer, _network(config, tokenizer, state, read.folder, torch.device(device)))
     if fixed:
         _set_statistics(policy, read)
     return policy.to(device)
 
 
-def _check(read: LeRobotFolder, cameras: Sequence[str], image_features: Sequence[str] | None) -> None:
+def _check(read: LeRobotFolder, cameras: Sequence[str], wanted: Sequence[str]) -> None:
     known = read.image_features
-    unknown = [name for name in image_features or () if name not in known]
+    unknown = [name for name in wanted if name not in known]
     if unknown:
         raise ValueError(f"{read.folder} has no image feature {unknown[0]!r}: image_features= of {', '.join(known)}")
-    wanted = tuple(image_features or known)
     if len(cameras) != len(wanted):
         raise ValueError(
             f"{read.folder} looks through {len(wanted)} cameras ({', '.join(wanted)}), got {len(cameras)} "
@@ -119,7 +122,9 @@ def _check(read: LeRobotFolder, cameras: Sequence[str], image_features: Sequence
         raise ValueError(f"{read.folder} looks at {read.fields['n_obs_steps']} observations: only 1 is known")
     for name, features in ((STATE, read.inputs), (ACTION, read.outputs)):
         if name not in features:
-            raise ValueError(f"{read.folder / 'config.json'} has no feature {name}: there are {', '.join(features)}")
+            raise ValueError(
+                f"{read.folder / 'config.json'} has no feature {name}: there are {', '.join(features) or 'none'}"
+            )
 
 
 def _settings(
