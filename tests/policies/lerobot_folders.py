@@ -1,7 +1,7 @@
 """Folders as LeRobot writes them, with weights that are a function of their names, and what its own files made of them.
 
-``lerobot/reference.json`` holds, for each kind, LeRobot's config, statistics, names and shapes of tensors, and the
-actions of its ``predict_action_chunk`` (huggingface/lerobot 7427f31 with transformers 5.5.4, at tiny sizes; of
+``lerobot_reference/actions.json`` holds, for each kind, LeRobot's config, statistics, names and shapes of tensors, and
+the actions of its ``predict_action_chunk`` (huggingface/lerobot 7427f31 with transformers 5.5.4, at tiny sizes; of
 ``lerobot`` only the modelling files were loaded). Weights, images, states and noise are made here again.
 """
 
@@ -23,7 +23,7 @@ from tokenizers import Regex, Tokenizer, models, pre_tokenizers, processors
 
 from worldenv_trl import keys
 
-REFERENCE = json.loads((Path(__file__).parent / "lerobot" / "reference.json").read_text())
+REFERENCE = json.loads((Path(__file__).parent / "lerobot_reference" / "actions.json").read_text())
 KINDS = ("smolvla", "smolvla_tokens", "pi0", "pi05")
 CAMERAS = ("agentview", "wrist")
 SIDE = 56

@@ -25,6 +25,7 @@ __all__ = ["load_lerobot"]
 
 STATE, ACTION = "observation.state", "action"
 CAMERAS = ("agentview", "wrist")
+DTYPE = "bfloat16"  # of the towers, where nothing else is asked for
 PALIGEMMA = "google/paligemma-3b-pt-224"  # whose tokenizer pi0 and pi0.5 read with
 VISION_HEADS = 16  # of PaliGemma's SigLIP; shapes of weights do not tell
 # What other robots and other trainings switch on, and is not done here.
@@ -89,7 +90,8 @@ def load_lerobot(
     cameras = CAMERAS[: len(wanted)] if cameras is None else tuple(cameras)
     _check(read, cameras, wanted)
     tokenizer, described = _backbone(read, backbone)
-    state = {} if torch.device(device).type == "meta" else dict(_renamed(read))
+    outline = torch.device(device).type == "meta"
+    state = {} if outline else _renamed(read, getattr(torch, settings.get("dtype", DTYPE), torch.float32), device)
     fixed = bool(settings.get("fixed_statistics", True))
     shapes = {name: tuple(tensor.shape) for name, tensor in state.items()} or _shapes(read)
     config = FlowConfig(**(_settings(read, shapes, described, fixed) | {"cameras": cameras} | settings))
@@ -171,7 +173,7 @@ def _settings(
         "max_period": fields.get("max_period", 4.0),
         "normalization": "mean_std" if mean_std else "quantiles",
         "fixed_statistics": fixed,
-        "dtype": "bfloat16",
+        "dtype": DTYPE,
     }
 
 
@@ -254,9 +256,14 @@ def _backbone(read: LeRobotFolder, named: str | os.PathLike | None) -> tuple[Tok
     return read_tokenizer(own or folder), described
 
 
-def _renamed(read: LeRobotFolder) -> dict[str, Tensor]:
-    """Weights by the names of :class:`~worldenv_trl.policies.flow_network.FlowNetwork`."""
-    tensors = {name: tensor for name, tensor in ((_name(name), tensor) for name, tensor in read.tensors()) if name}
+def _renamed(read: LeRobotFolder, dtype: torch.dtype, device: str | torch.device) -> dict[str, Tensor]:
+    """Weights by the names of :class:`~worldenv_trl.policies.flow_network.FlowNetwork`; its towers' in ``dtype``."""
+    tensors = {}
+    for old, tensor in read.tensors():
+        name = _name(old)
+        if name is not None:
+            tower = name.startswith(("backbone.", "expert."))
+            tensors[name] = tensor.to(device, dtype if tower else torch.float32)
     return _untied(tensors)
 
 

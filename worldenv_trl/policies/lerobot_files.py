@@ -65,8 +65,8 @@ class LeRobotFolder:
     folder: Path
     kind: str
     fields: Mapping[str, Any]
-    inputs: Mapping[str, Feature]
-    outputs: Mapping[str, Feature]
+    inputs: dict[str, Feature]
+    outputs: dict[str, Feature]
     normalization: Mapping[str, str]
     statistics: Mapping[str, Mapping[str, Tensor]]
     weights: Sequence[Path]
@@ -83,7 +83,7 @@ class LeRobotFolder:
         Raises:
             ValueError: if a statistic is missing, not finite, or of another shape than the feature.
         """
-        feature = (self.inputs | self.outputs)[name]  # type: ignore[operator]
+        feature = (self.inputs | self.outputs)[name]
         mode = self.normalization.get(feature.kind, "IDENTITY")
         first, second = (self._statistic(name, each, feature, mode) for each in STATISTICS_OF[mode] or (None, None))
         if mode == "IDENTITY":
@@ -95,7 +95,7 @@ class LeRobotFolder:
 
     def half_range(self, name: str) -> Tensor:
         """Half the range that the training data used of a feature, as well as the statistics tell."""
-        known, feature = self.statistics.get(name, {}), (self.inputs | self.outputs)[name]  # type: ignore[operator]
+        known, feature = self.statistics.get(name, {}), (self.inputs | self.outputs)[name]
         for low, high in (("q01", "q99"), ("min", "max")):
             if {low, high} <= set(known):
                 return (known[high] - known[low]) / 2
