@@ -118,8 +118,8 @@ def sinusoids(time: float, dim: int, shortest: float, longest: float, device: to
     """Sines, then cosines of a time in [0, 1], of periods between these two: float32 [1, dim].
 
     Examples:
-        >>> sinusoids(0.25, 4, 0.5, 1.0, torch.device("cpu")).round(decimals=3)
-        tensor([[ 0.,  1., -1., -0.]])
+        >>> sinusoids(0.0, 6, 0.5, 1.0, torch.device("cpu"))
+        tensor([[0., 0., 0., 1., 1., 1.]])
     """
     return torch.from_numpy(_sinusoids(time, dim, shortest, longest)).to(device)
 
