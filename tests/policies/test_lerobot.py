@@ -200,6 +200,15 @@ def rewrite(name: str, **changes):
     return damage
 
 
+def without(name: str, field: str):
+    def damage(folder: Path) -> None:
+        fields = json.loads((folder / name).read_text())
+        (folder / name).unlink()
+        (folder / name).write_text(json.dumps({each: value for each, value in fields.items() if each != field}))
+
+    return damage
+
+
 def reweigh(change):
     def damage(folder: Path) -> None:
         state = load_file(folder / "model.safetensors")
@@ -251,6 +260,7 @@ LAYER = "model.vlm_with_expert.lm_expert.layers.1.mlp.up_proj.weight"
         ),
         (rewrite("config.json", output_features={}), ValueError, "has no feature action"),
         (rewrite("config.json", adapt_to_pi_aloha=True), ValueError, "trained with adapt_to_pi_aloha"),
+        (without("config.json", "chunk_size"), ValueError, "config.json lacks chunk_size: fetch it again"),
         (rewrite("config.json", n_obs_steps=2), ValueError, "looks at 2 observations: only 1 is known"),
         (
             rewrite("config.json", resize_imgs_with_padding=[28, 14]),

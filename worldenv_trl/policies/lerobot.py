@@ -15,6 +15,7 @@ from worldenv_trl import hub
 from worldenv_trl.keys import ACTION_DIM, STATE_DIM
 from worldenv_trl.policies.flow import FlowConfig, FlowPolicy, make_network
 from worldenv_trl.policies.flow_network import FLOW_FAMILIES
+from worldenv_trl.policies.hf_backbone import backbone_config
 from worldenv_trl.policies.hf_files import read_json, read_tokenizer
 from worldenv_trl.policies.lerobot_files import LeRobotFolder, read_lerobot_folder
 
@@ -28,6 +29,7 @@ CAMERAS = ("agentview", "wrist")
 DTYPE = "bfloat16"  # of the towers, where nothing else is asked for
 PALIGEMMA = "google/paligemma-3b-pt-224"  # whose tokenizer pi0 and pi0.5 read with
 VISION_HEADS = 16  # of PaliGemma's SigLIP; shapes of weights do not tell
+_NEEDED = ("chunk_size", "max_state_dim", "max_action_dim", "tokenizer_max_length")
 # What other robots and other trainings switch on, and is not done here.
 _UNKNOWN = ("adapt_to_pi_aloha", "use_relative_actions", "use_visual_memory", "use_proprioceptive_memory")
 _RENAMED = (
@@ -122,6 +124,9 @@ def _check(read: LeRobotFolder, cameras: Sequence[str], wanted: Sequence[str]) -
         raise ValueError(f"{read.folder} puts tokens around images of cameras that are not there: this is not known")
     if read.fields.get("n_obs_steps", 1) != 1:
         raise ValueError(f"{read.folder} looks at {read.fields['n_obs_steps']} observations: only 1 is known")
+    missing = [name for name in _NEEDED if name not in read.fields]
+    if missing:
+        raise ValueError(f"{read.folder / 'config.json'} lacks {', '.join(missing)}: fetch it again")
     for name, features in ((STATE, read.inputs), (ACTION, read.outputs)):
         if name not in features:
             raise ValueError(
@@ -180,14 +185,15 @@ def _settings(
 def _smolvlm(
     described: Mapping[str, Any], shapes: Mapping[str, Sequence[int]], fields: Mapping[str, Any]
 ) -> dict[str, Any]:
-    text = dict(described["text_config"])
+    described = backbone_config(described).to_dict()
+    text = described["text_config"]
     layers = "backbone.model.text_model.layers."
     found = 1 + max((int(name.split(".")[4]) for name in shapes if name.startswith(layers)), default=-1)
     used = fields.get("num_vlm_layers", 16)
     text["num_hidden_layers"] = min(found, used) if used > 0 else found
     if "backbone.model.text_model.embed_tokens.weight" in shapes:
         text["vocab_size"] = shapes["backbone.model.text_model.embed_tokens.weight"][0]
-    return {**described, "text_config": text}
+    return described
 
 
 def _paligemma(shapes: Mapping[str, Sequence[int]], side: int) -> dict[str, Any]:
