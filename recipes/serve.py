@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 import tyro
@@ -30,6 +31,9 @@ class Settings:
     """Folder or Hub id of an OFTPolicy, HFPolicy or FlowPolicy, or folder of an OpenVLA-OFT release or of LeRobot."""
     address: str = "127.0.0.1:8765"
     """``host:port``, port 0 for any free one, or ``unix:/path``. It answers whoever reaches it."""
+    backbone: str = ""
+    """Folder or Hub id of which LeRobot's policy has its tokenizer, and SmolVLA its backbone's config; when empty its
+    own folder, and what its config names."""
     mirror: bool = False
     """LeRobot's policy sees images with left and right swapped: those of LIBERO's data sets are mirrored."""
     device: str = "auto"
@@ -40,14 +44,15 @@ class Settings:
 @one_line_errors
 def main(settings: Settings) -> None:
     use_threads(settings.num_threads)
-    policy = load_policy(settings.checkpoint, choose_device(settings.device), settings.mirror)
+    released = {"backbone": settings.backbone or None, "mirror": settings.mirror}
+    policy = load_policy(settings.checkpoint, choose_device(settings.device), **released)
     name = Path(settings.checkpoint).name
     served = ServedPolicy(policy, name=f"{type(policy).__name__} {name}", digest=model_hash(policy))
     serve(served, served.description, settings.address)
 
 
-def load_policy(checkpoint: str, device: torch.device, mirror: bool = False) -> Policy:
-    """A checkpoint of any of our policies; ``mirror`` is a setting of LeRobot's alone.
+def load_policy(checkpoint: str, device: torch.device, **released: Any) -> Policy:
+    """A checkpoint of any of our policies; ``released`` are settings of LeRobot's alone.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -57,7 +62,7 @@ def load_policy(checkpoint: str, device: torch.device, mirror: bool = False) -> 
         return load_openvla_oft(checkpoint, device=device)
     config = Path(checkpoint) / "config.json"
     if config.is_file() and "input_features" in read_json(config.parent, config.name):
-        return load_lerobot(checkpoint, device=device, mirror=mirror)
+        return load_lerobot(checkpoint, device=device, **released)
     for kind in (OFTPolicy, HFPolicy):
         try:
             return kind.from_pretrained(checkpoint, device=device)

@@ -303,6 +303,24 @@ def test_what_is_wrong_with_a_folder_is_said_in_one_line(damaged, damage, error,
 
 
 @pytest.mark.parametrize(
+    ("kind", "said", "message"),
+    [
+        ("pi0", "pi05", r"\d+ tensors are missing \(expert.layers.0.input_layernorm.dense.bias, .* are unknown"),
+        ("smolvla", "pi0", "holds no weights of a PaliGemma: this is no pi0 of LeRobot"),
+    ],
+)
+def test_weights_of_another_kind_than_the_config_says_are_refused(folders, tmp_path, kind, said, message):
+    for path in folders[kind].iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    rewrite("config.json", type=said)(tmp_path)
+    if not (tmp_path / "tokenizer.json").exists():
+        tokenizer(True).save(str(tmp_path / "tokenizer.json"))
+    with pytest.raises(ValueError, match=message) as caught:
+        load_lerobot(tmp_path, **SETTINGS)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"cameras": ("agentview",)}, r"looks through 2 cameras \(.*image, .*image2\), got 1 \(agentview\): name one"),

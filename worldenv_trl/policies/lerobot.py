@@ -14,10 +14,10 @@ from torch import Tensor
 from worldenv_trl import hub
 from worldenv_trl.keys import ACTION_DIM, STATE_DIM
 from worldenv_trl.policies.flow import FlowConfig, FlowPolicy, make_network
-from worldenv_trl.policies.flow_network import FLOW_FAMILIES
+from worldenv_trl.policies.flow_network import FLOW_FAMILIES, FlowNetwork
 from worldenv_trl.policies.hf_backbone import backbone_config
 from worldenv_trl.policies.hf_files import read_json, read_tokenizer
-from worldenv_trl.policies.lerobot_files import LeRobotFolder, read_lerobot_folder
+from worldenv_trl.policies.lerobot_files import Affine, LeRobotFolder, read_lerobot_folder
 
 if TYPE_CHECKING:
     from tokenizers import Tokenizer
@@ -92,14 +92,12 @@ def load_lerobot(
     cameras = CAMERAS[: len(wanted)] if cameras is None else tuple(cameras)
     _check(read, cameras, wanted)
     tokenizer, described = _backbone(read, backbone)
-    outline = torch.device(device).type == "meta"
-    state = {} if outline else _renamed(read, getattr(torch, settings.get("dtype", DTYPE), torch.float32), device)
     fixed = bool(settings.get("fixed_statistics", True))
-    shapes = {name: tuple(tensor.shape) for name, tensor in state.items()} or _shapes(read)
-    config = FlowConfig(**(_settings(read, shapes, described, fixed) | {"cameras": cameras} | settings))
-    policy = FlowPolicy(config, tokenizer, _network(config, tokenizer, state, read.folder, torch.device(device)))
-    if fixed:
-        _set_statistics(policy, read)
+    config = FlowConfig(**(_settings(read, _shapes(read), described, fixed) | {"cameras": cameras} | settings))
+    statistics = (read.normalizer(STATE), read.normalizer(ACTION)) if fixed else None
+    policy = FlowPolicy(config, tokenizer, _network(config, tokenizer, read, torch.device(device)))
+    if statistics is not None:
+        _set_statistics(policy, *statistics, read.half_range(ACTION))
     return policy.to(device)
 
 
@@ -158,7 +156,7 @@ def _settings(
         "num_hidden_layers": count,
     }
     crossing = read.kind == "smolvla" and "cross" in fields.get("attention_mode", "cross_attn")
-    network = _smolvlm(described, shapes, fields) if read.kind == "smolvla" else _paligemma(shapes, side[0])
+    network = _smolvlm(described, shapes, fields) if read.kind == "smolvla" else _paligemma(read, shapes, side[0])
     mean_std = read.normalization.get("ACTION") == "MEAN_STD"
     return {
         "kind": read.kind,
@@ -196,13 +194,13 @@ def _smolvlm(
     return described
 
 
-def _paligemma(shapes: Mapping[str, Sequence[int]], side: int) -> dict[str, Any]:
+def _paligemma(read: LeRobotFolder, shapes: Mapping[str, Sequence[int]], side: int) -> dict[str, Any]:
     """Sizes as the weights have them; what sizes do not tell, as all of openpi's have it."""
     text, vision = "backbone.model.language_model.", "backbone.model.vision_tower."
     patch = f"{vision}embeddings.patch_embedding.weight"
     keys, queries = (f"{text}layers.0.self_attn.{each}_proj.weight" for each in "kq")
     if patch not in shapes or keys not in shapes:
-        raise ValueError("the safetensors hold no PaliGemma: a file is missing, or this is another network")
+        raise ValueError(f"{read.folder} holds no weights of a PaliGemma: this is no {read.kind} of LeRobot")
     count = {
         name: 1 + max(int(each.split(".")[at]) for each in shapes if each.startswith(name))
         for name, at in ((f"{text}layers.", 4), (f"{vision}encoder.layers.", 5))
@@ -262,7 +260,7 @@ def _backbone(read: LeRobotFolder, named: str | os.PathLike | None) -> tuple[Tok
     return read_tokenizer(own or folder), described
 
 
-def _renamed(read: LeRobotFolder, dtype: torch.dtype, device: str | torch.device) -> dict[str, Tensor]:
+def _renamed(read: LeRobotFolder, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
     """Weights by the names of :class:`~worldenv_trl.policies.flow_network.FlowNetwork`; its towers' in ``dtype``."""
     tensors = {}
     for old, tensor in read.tensors():
@@ -296,9 +294,7 @@ def _untied(found: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _network(
-    config: FlowConfig, tokenizer: Tokenizer, state: Mapping[str, Tensor], folder: Path, device: torch.device
-) -> Any:
+def _network(config: FlowConfig, tokenizer: Tokenizer, read: LeRobotFolder, device: torch.device) -> FlowNetwork:
     from transformers.initialization import no_init_weights
 
     if device.type == "meta":
@@ -306,7 +302,7 @@ def _network(
             return make_network(config, tokenizer)
     with no_init_weights():  # billions of random numbers take minutes
         network = make_network(config, tokenizer)
-    wanted = network.state_dict()
+    state, wanted = _renamed(read, getattr(torch, config.dtype), device), network.state_dict()
     prefix = (
         "backbone.model.text_model.layers." if config.kind == "smolvla" else "backbone.model.language_model.layers."
     )
@@ -320,16 +316,15 @@ def _network(
         found = [f"{len(missing)} tensors are missing ({', '.join(missing[:2])})"] if missing else []
         found += [f"{len(unknown)} are unknown ({', '.join(unknown[:2])})"] if unknown else []
         found += [f"{name} is {list(kept[name].shape)}, not {list(wanted[name].shape)}" for name in wrong[:1]]
-        raise ValueError(f"{folder} does not hold the network of its config: {'; '.join(found)}")
+        raise ValueError(f"{read.folder} does not hold the network of its config: {'; '.join(found)}")
     network.load_state_dict({name: tensor.to(wanted[name].dtype) for name, tensor in kept.items()}, assign=True)
     return network
 
 
 @torch.no_grad()
-def _set_statistics(policy: FlowPolicy, read: LeRobotFolder) -> None:
-    state, action = read.normalizer(STATE), read.normalizer(ACTION)
+def _set_statistics(policy: FlowPolicy, state: Affine, action: Affine, half_range: Tensor) -> None:
     policy.state_center.copy_(state.center)
     policy.state_gain.copy_(state.gain)
     policy.action_center.copy_(action.center)
     policy.action_gain.copy_(action.gain)
-    policy.action_range.copy_(read.half_range(ACTION).clamp(min=0.005, max=1.0))
+    policy.action_range.copy_(half_range.clamp(min=0.005, max=1.0))
