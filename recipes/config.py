@@ -171,13 +171,18 @@ class RealSize:
     """Local folders of pretrained parts, and what they are made with. Read with ``parts`` at ``real-size`` alone."""
 
     policy: Path | None = None
-    """A vision-language model as transformers' ``save_pretrained`` wrote it, or a checkpoint of OpenVLA or OpenVLA-OFT.
-    """
+    """A vision-language model as transformers' ``save_pretrained`` wrote it, a checkpoint of OpenVLA or OpenVLA-OFT, or
+    LeRobot's of SmolVLA, pi0 or pi0.5."""
     statistics: str = ""
     """Key of the checkpoint's ``dataset_statistics.json``; the only one when empty."""
     action_head: str = "continuous"
     """Of the policy: ``continuous`` (OpenVLA-OFT's heads, a Laplace density) or ``tokens`` (OpenVLA's, the vocabulary's
     last tokens one after the other)."""
+    backbone: str = ""
+    """Folder or Hub id of which LeRobot's policy has its tokenizer, and SmolVLA its backbone's config; when empty its
+    own folder, and what its config names."""
+    mirror: bool = False
+    """LeRobot's policy sees images with left and right swapped: those of LIBERO's data sets are mirrored."""
     reflector: Path | None = None
     """A LLaVA-OneVision or LLaVA-Video model as ``save_pretrained`` wrote it."""
     world_model: Path | None = None

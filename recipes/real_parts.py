@@ -10,7 +10,15 @@ import torch
 
 from config import WorldEnvConfig
 from parts import COMPACT, PROPRIO, Part, Parts, instructions
-from worldenv_trl.policies import HFPolicy, HFTokenPolicy, Policy, load_openvla, load_openvla_oft
+from worldenv_trl.policies import (
+    FlowPolicy,
+    HFPolicy,
+    HFTokenPolicy,
+    Policy,
+    load_lerobot,
+    load_openvla,
+    load_openvla_oft,
+)
 from worldenv_trl.policies.hf_files import check_weights, read_json
 from worldenv_trl.reflectors import Reflector, VLMReflector, VLMReflectorConfig
 from worldenv_trl.reflectors.video_language_model import VideoLanguageModel
@@ -32,8 +40,9 @@ def parts_of(config: WorldEnvConfig) -> Parts:
     return REAL_SIZE if config.parts == "real-size" else COMPACT
 
 
-def make_policy(config: WorldEnvConfig, device: str = "cpu") -> HFPolicy | HFTokenPolicy:
-    """A checkpoint of OpenVLA-OFT or OpenVLA, or the recipe of one of them over a vision-language model.
+def make_policy(config: WorldEnvConfig, device: str = "cpu") -> Policy:
+    """A checkpoint of OpenVLA-OFT or OpenVLA, LeRobot's of a flow-matching policy, or a vision-language model that is to
+    act as OpenVLA-OFT's or OpenVLA's does.
 
     Raises:
         FileNotFoundError: if the folder lacks a file.
@@ -41,7 +50,16 @@ def make_policy(config: WorldEnvConfig, device: str = "cpu") -> HFPolicy | HFTok
     """
     folder = _named(config, "policy")
     settings = policy_settings(config)
-    openvla = read_json(folder, "config.json").get("model_type") == "openvla"
+    described = read_json(folder, "config.json")
+    if "input_features" in described:
+        if by_tokens(config):
+            raise ValueError(
+                f"{folder} holds LeRobot's policy, which does not act by tokens: --real-size.action-head continuous"
+            )
+        chosen = config.real_size
+        settings |= {"backbone": chosen.backbone or None, "mirror": chosen.mirror, "chunk_length": config.chunk_length}
+        return load_lerobot(folder, device=device, **settings)
+    openvla = described.get("model_type") == "openvla"
     if by_tokens(config):
         settings["chunk_length"] = config.chunk_length
         if not openvla:
@@ -62,10 +80,12 @@ def make_policy(config: WorldEnvConfig, device: str = "cpu") -> HFPolicy | HFTok
     return load_openvla_oft(folder, statistics=config.real_size.statistics or None, device=device, **settings)
 
 
-def load_policy(folder: Path) -> HFPolicy | HFTokenPolicy:
+def load_policy(folder: Path) -> Policy:
     """What ``save_pretrained`` of a policy of :func:`make_policy` wrote."""
-    tokens = read_json(folder, "config.json").get("class") == HFTokenPolicy.__name__
-    return (HFTokenPolicy if tokens else HFPolicy).from_pretrained(folder)
+    written = read_json(folder, "config.json").get("class")
+    kinds: tuple[type[HFTokenPolicy] | type[FlowPolicy], ...] = (HFTokenPolicy, FlowPolicy)
+    kind = next((kind for kind in kinds if kind.__name__ == written), HFPolicy)
+    return kind.from_pretrained(folder)
 
 
 def by_tokens(config: WorldEnvConfig) -> bool:
@@ -81,7 +101,7 @@ def by_tokens(config: WorldEnvConfig) -> bool:
 
 
 def policy_settings(config: WorldEnvConfig) -> dict[str, Any]:
-    """Fields of :class:`~worldenv_trl.policies.HFConfig`, or of its like for tokens, that the run decides."""
+    """Fields of :class:`~worldenv_trl.policies.HFConfig`, or of its like, that the run decides."""
     return {
         "instructions": instructions(config),
         "cameras": config.sft.cameras or config.cameras,

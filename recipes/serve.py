@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 import tyro
@@ -18,11 +19,13 @@ from command_line import one_line_errors
 from threads import use_threads
 from worldenv_trl.devices import choose_device
 from worldenv_trl.policies import (
+    FlowPolicy,
     HFPolicy,
     HFTokenPolicy,
     OFTPolicy,
     Policy,
     ServedPolicy,
+    load_lerobot,
     load_openvla,
     load_openvla_oft,
 )
@@ -35,9 +38,15 @@ from worldenv_trl.record import model_hash
 @dataclass(frozen=True)
 class Settings:
     checkpoint: tyro.conf.Positional[str]
-    """Folder or Hub id of an OFTPolicy, HFPolicy or HFTokenPolicy, or folder of a release of OpenVLA or OpenVLA-OFT."""
+    """Folder or Hub id of an OFTPolicy, HFPolicy, HFTokenPolicy or FlowPolicy, or folder of a release of OpenVLA, of
+    OpenVLA-OFT or of LeRobot."""
     address: str = "127.0.0.1:8765"
     """``host:port``, port 0 for any free one, or ``unix:/path``. It answers whoever reaches it."""
+    backbone: str = ""
+    """Folder or Hub id of which LeRobot's policy has its tokenizer, and SmolVLA its backbone's config; when empty its
+    own folder, and what its config names."""
+    mirror: bool = False
+    """LeRobot's policy sees images with left and right swapped: those of LIBERO's data sets are mirrored."""
     device: str = "auto"
     """``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one."""
     num_threads: int = 1
@@ -46,29 +55,33 @@ class Settings:
 @one_line_errors
 def main(settings: Settings) -> None:
     use_threads(settings.num_threads)
-    policy = load_policy(settings.checkpoint, choose_device(settings.device))
+    released = {"backbone": settings.backbone or None, "mirror": settings.mirror}
+    policy = load_policy(settings.checkpoint, choose_device(settings.device), **released)
     name = Path(settings.checkpoint).name
     served = ServedPolicy(policy, name=f"{type(policy).__name__} {name}", digest=model_hash(policy))
     serve(served, served.description, settings.address)
 
 
-def load_policy(checkpoint: str, device: torch.device) -> Policy:
-    """A checkpoint of any of our policies.
+def load_policy(checkpoint: str, device: torch.device, **released: Any) -> Policy:
+    """A checkpoint of any of our policies; ``released`` are settings of LeRobot's alone.
 
     Raises:
         FileNotFoundError: if there is none.
         ValueError: if it is one of another kind.
     """
     folder = Path(checkpoint)
-    if (folder / "config.json").is_file() and read_json(folder, "config.json").get("model_type") == "openvla":
+    described = read_json(folder, "config.json") if (folder / "config.json").is_file() else {}
+    if described.get("model_type") == "openvla":
         release = load_openvla_oft if any(folder.glob("action_head--*")) else load_openvla
         return release(folder, device=device)
-    for kind in (OFTPolicy, HFPolicy):
+    if "input_features" in described:
+        return load_lerobot(checkpoint, device=device, **released)
+    for kind in (OFTPolicy, HFPolicy, HFTokenPolicy):
         try:
             return kind.from_pretrained(checkpoint, device=device)
         except OtherClassError:
             continue
-    return HFTokenPolicy.from_pretrained(checkpoint, device=device)
+    return FlowPolicy.from_pretrained(checkpoint, device=device)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from worldenv_trl.policies.images import centre_crop, lanczos_resize, prepare_images
+from worldenv_trl.policies.images import bilinear_resize, centre_crop, lanczos_resize, prepare_images
 
 
 @pytest.mark.parametrize("size", [(256, 224), (64, 224), (100, 48)])
@@ -64,3 +64,18 @@ def test_half_a_turn_swaps_both_axes_and_mean_and_deviation_are_each_channels():
 def test_what_cannot_be_done_to_an_image_is_named(settings, message):
     with pytest.raises(ValueError, match=message):
         prepare_images(torch.zeros(3, 8, 8, dtype=torch.uint8), 8, **settings)
+
+
+@pytest.mark.parametrize("after", [20, 7, 10])
+def test_bilinear_resizing_weighs_the_four_pixels_around_each_new_centre(after):
+    side = 10
+    image = torch.randint(0, 256, (2, 3, side, side), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    resized = bilinear_resize(image, after)
+    assert resized.shape == (2, 3, after, after) and resized.dtype == torch.float32
+    padded = np.pad(image[1, 2].numpy() / 255, 1, mode="edge")
+    for row, column in ((0, 0), (3, 5), (after - 1, 2)):
+        y, x = ((each + 0.5) * side / after + 0.5 for each in (row, column))  # of the padded image's centres
+        top, left = int(y), int(x)
+        square = padded[top : top + 2, left : left + 2]
+        wanted = np.array([1 - (y - top), y - top]) @ square @ np.array([1 - (x - left), x - left])
+        assert resized[1, 2, row, column].item() == pytest.approx(wanted, abs=1e-6)

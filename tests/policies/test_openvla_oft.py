@@ -227,7 +227,7 @@ def test_another_kind_of_checkpoint_is_named_with_what_reads_it(released, damage
     for fields, message in (
         ({"model_type": "llava"}, "a model of type 'llava': what reads it is HFPolicy.from_backbone"),
         ({"class": "HFPolicy", "config": {}}, "a HFPolicy of worldenv_trl: what reads it is HFPolicy.from_pretrained"),
-        ({"type": "pi0", "input_features": {}}, "a LeRobot policy of type 'pi0': what reads it is LeRobot alone"),
+        ({"type": "pi0", "input_features": {}}, "a LeRobot policy of type 'pi0': what reads it is load_lerobot"),
     ):
         (damaged / "config.json").unlink()
         (damaged / "config.json").write_text(json.dumps(fields))

@@ -6,6 +6,7 @@ from copy import deepcopy
 
 import pytest
 import torch
+from flow_models import flow_policy
 from hf_models import hf_policy
 from observations import INSTRUCTIONS, TEXTS, observed, oft_policy
 from swaps.mlp_policy import MLPConfig, MLPPolicy
@@ -24,7 +25,7 @@ def mlp_policy() -> MLPPolicy:
     return MLPPolicy(MLPConfig(instructions=INSTRUCTIONS))
 
 
-@pytest.fixture(params=[oft_policy, mlp_policy, hf_policy], ids=["oft", "mlp", "hf"])
+@pytest.fixture(params=[oft_policy, mlp_policy, hf_policy, flow_policy], ids=["oft", "mlp", "hf", "flow"])
 def policy(request):
     return request.param()
 

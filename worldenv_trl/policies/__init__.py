@@ -1,5 +1,5 @@
 """Policies: the interface, the Laplace distribution and actor, the compact OFT policy, policies over
-Hugging Face vision-language models and behind servers, image augmentation."""
+Hugging Face vision-language models and behind servers, LeRobot's flow-matching policies, image augmentation."""
 
 from worldenv_trl.policies.action_tokens import QuantileActionTokenizer
 from worldenv_trl.policies.actor import LaplaceActor, laplace_actor, likelihood_actor, policy_actor, scale_bounds
@@ -8,9 +8,11 @@ from worldenv_trl.policies.autoregressive import AutoregressiveActor, TeacherFor
 from worldenv_trl.policies.base import Policy
 from worldenv_trl.policies.device_bridge import DeviceBridge
 from worldenv_trl.policies.external import ExternalConfig, ExternalPolicy
+from worldenv_trl.policies.flow import FlowConfig, FlowPolicy
 from worldenv_trl.policies.hf import HFConfig, HFPolicy
 from worldenv_trl.policies.hf_tokens import HFTokenConfig, HFTokenPolicy
 from worldenv_trl.policies.laplace import IndependentLaplace
+from worldenv_trl.policies.lerobot import load_lerobot
 from worldenv_trl.policies.oft import OFTConfig, OFTPolicy
 from worldenv_trl.policies.openvla import load_openvla
 from worldenv_trl.policies.openvla_oft import load_openvla_oft
@@ -24,6 +26,8 @@ __all__ = [
     "DeviceBridge",
     "ExternalConfig",
     "ExternalPolicy",
+    "FlowConfig",
+    "FlowPolicy",
     "HFConfig",
     "HFPolicy",
     "HFTokenConfig",
@@ -42,6 +46,7 @@ __all__ = [
     "check_pairing",
     "laplace_actor",
     "likelihood_actor",
+    "load_lerobot",
     "load_openvla",
     "load_openvla_oft",
     "policy_actor",

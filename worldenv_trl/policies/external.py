@@ -164,7 +164,7 @@ class ExternalPolicy(Policy, Pretrained):
         raise RuntimeError(
             f"the policy served at {self.config.address} can be evaluated and explored with, but not trained: its "
             "weights are in another process and no gradient or density of its own comes from there. Post-train an "
-            "OFTPolicy or an HFPolicy"
+            "OFTPolicy, an HFPolicy or a FlowPolicy"
         )
 
     def fit_statistics(self, states: Tensor, actions: Tensor) -> None:

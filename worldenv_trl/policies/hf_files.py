@@ -35,7 +35,7 @@ def check_kind(fields: dict[str, Any], folder: Path, wanted: str) -> None:
     Args:
         fields: of ``config.json``.
         folder: where it is.
-        wanted: ``backbone``, transformers' own, or ``openvla``.
+        wanted: ``backbone``, transformers' own, ``openvla`` or ``lerobot``.
 
     Raises:
         ValueError: for another kind.
@@ -43,10 +43,12 @@ def check_kind(fields: dict[str, Any], folder: Path, wanted: str) -> None:
     if "class" in fields and "config" in fields:
         found, reader = f"a {fields['class']} of worldenv_trl", f"{fields['class']}.from_pretrained"
     elif "model_type" not in fields and {"type", "input_features"} & set(fields):
-        found, reader = f"a LeRobot policy of type {fields.get('type')!r}", "LeRobot alone: it runs there, not here"
+        if wanted == "lerobot":
+            return
+        found, reader = f"a LeRobot policy of type {fields.get('type')!r}", "load_lerobot"
     elif fields.get("model_type") == "openvla" and wanted != "openvla":
         found, reader = "an OpenVLA checkpoint", "load_openvla_oft, or load_openvla where it acts by tokens"
-    elif fields.get("model_type") != "openvla" and wanted == "openvla":
+    elif fields.get("model_type") != "openvla" and wanted != "backbone":
         found, reader = f"a model of type {fields.get('model_type')!r}", "HFPolicy.from_backbone"
     else:
         return
@@ -123,14 +125,14 @@ def read_tokenizer(folder: Path) -> Tokenizer:
     return Tokenizer.from_file(str(path))
 
 
-def check_weights(folder: Path) -> list[Path]:
-    """The safetensors files of a folder.
+def check_weights(folder: Path, pattern: str = "*.safetensors") -> list[Path]:
+    """The safetensors files of a folder, those whose names are like ``pattern``.
 
     Raises:
         FileNotFoundError: if there are no weights, or a file is missing that their index lists.
         ValueError: if they are pickled: reading them could run any code; the command that converts them is said.
     """
-    found = sorted(folder.glob("*.safetensors"))
+    found = sorted(folder.glob(pattern))
     index = folder / "model.safetensors.index.json"
     if index.is_file():
         listed = sorted(set(read_json(folder, index.name).get("weight_map", {}).values()))
@@ -145,7 +147,7 @@ def check_weights(folder: Path) -> list[Path]:
             f"{folder} holds its weights as pickles alone ({pickled[0]}), which can run any code when read. If you "
             "trust where they are from, convert them once: " + convert_command(folder / pickled[0])
         )
-    raise FileNotFoundError(f"{folder} holds no weights: *.safetensors is missing")
+    raise FileNotFoundError(f"{folder} holds no weights: {pattern} is missing")
 
 
 def convert_command(path: Path) -> str:

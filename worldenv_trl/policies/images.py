@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["centre_crop", "lanczos_resize", "prepare_images"]
+__all__ = ["bilinear_resize", "centre_crop", "lanczos_resize", "prepare_images"]
 
 
 def prepare_images(
@@ -67,6 +67,20 @@ def lanczos_resize(images: Tensor, size_px: int) -> Tensor:
     # A matrix for each side: two products, on whatever device the images are.
     rows, columns = (torch.from_numpy(_lanczos(side, size_px)).to(images.device) for side in (height, width))
     return (rows @ pixels @ columns.mT).round().clamp(0, 255)
+
+
+def bilinear_resize(images: Tensor, size_px: int) -> Tensor:
+    """Square images resized bilinearly without antialiasing, as SmolVLA and openpi do it.
+
+    Args:
+        images: uint8 [*B, C, S, S].
+        size_px: side of the result, float32 in [0, 1], [*B, C, size_px, size_px].
+    """
+    pixels = images.float() / 255
+    if images.shape[-1] == size_px:
+        return pixels
+    resized = torch.nn.functional.interpolate(pixels.flatten(0, -4), (size_px, size_px), mode="bilinear")
+    return resized.unflatten(0, images.shape[:-3])
 
 
 def centre_crop(pixels: Tensor, area: float) -> Tensor:
