@@ -41,8 +41,8 @@ def parts_of(config: WorldEnvConfig) -> Parts:
 
 
 def make_policy(config: WorldEnvConfig, device: str = "cpu") -> Policy:
-    """A checkpoint of OpenVLA-OFT or OpenVLA, LeRobot's of a flow-matching policy, or a vision-language model that is to
-    act as OpenVLA-OFT's or OpenVLA's does.
+    """A checkpoint of OpenVLA-OFT or OpenVLA, LeRobot's of a flow-matching policy, or a vision-language model that
+    is to act as OpenVLA-OFT's or OpenVLA's does.
 
     Raises:
         FileNotFoundError: if the folder lacks a file.
