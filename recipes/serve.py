@@ -51,7 +51,7 @@ def load_policy(checkpoint: str, device: torch.device) -> Policy:
         ValueError: if it is one of another kind.
     """
     if (Path(checkpoint) / "dataset_statistics.json").exists():
-        return load_openvla_oft(checkpoint, device=device)
+        return load_openvla_oft(checkpoint, device=device, mirror=True)  # it is asked with upright images
     try:
         return OFTPolicy.from_pretrained(checkpoint, device=device)
     except OtherClassError:

@@ -45,7 +45,7 @@ def load_openvla_oft(
     Backbone, action head, projector of proprioception and statistics are the checkpoint's. The scale head is new, for
     OpenVLA-OFT has none: train it before LOOP. Actions come out in this package's convention: the checkpoint's gripper,
     0 closed and 1 open, becomes +1 closed and -1 open. Images must be as LIBERO's data set shows them to the
-    checkpoint; ``rotation=180`` turns the simulator's raw ones.
+    checkpoint: ``mirror=True`` makes them of upright ones, ``rotation=180`` of the simulator's raw ones.
 
     Args:
         folder: with ``config.json``, the backbone's safetensors, ``action_head--*_checkpoint.safetensors`` and
