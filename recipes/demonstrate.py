@@ -1,4 +1,4 @@
-"""Scripted-expert demonstrations from the first training initial states.
+"""Scripted-expert demonstrations from the first training initial states, or those of LIBERO's files.
 
 Alone: ``python recipes/demonstrate.py improve --run-dir runs/improve``.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import torch
 from tqdm import tqdm
 
+from libero_files import convert, from_libero
 from physics import recording, tabletop
 from run import Run
 from stages import run_alone
@@ -21,6 +22,9 @@ def demonstrate(run: Run) -> None:
     """Writes ``rollouts/demonstrations.mcap``; raises ``RuntimeError`` if the expert fails one."""
     config, folder = run.config, run.folder
     run.seed_everything("demonstrate")
+    if from_libero(config):
+        convert(run)
+        return
     count = config.demonstrate.episodes_per_task
     options = {"init_state_mode": "cycle", "terminate_on_success": True, "with_sim_state": True}
     described = tabletop(config, "train", len(config.tasks), None, **options)

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from config import WorldEnvConfig
+from libero_files import from_libero
 from parts import COMPACT, PROPRIO, Part, Parts, instructions
 from worldenv_trl.policies import HFPolicy, Policy, load_openvla_oft
 from worldenv_trl.policies.hf_files import check_weights, read_json
@@ -47,6 +48,9 @@ def make_policy(config: WorldEnvConfig, device: str = "cpu") -> HFPolicy:
             f"{folder} was trained with 2 cameras, got {len(settings['cameras'])} ({', '.join(settings['cameras'])}): "
             "--cameras agentview wrist, and leave --sft.cameras out"
         )
+    # Its images were LIBERO's raw ones turned by 180 degrees: ours, which are upright, mirrored. Its bounds are of
+    # LIBERO's world and controller; those of the run's own demonstrations of LIBERO mean the same here.
+    settings |= {"mirror": True, "fixed_statistics": not from_libero(config)}
     return load_openvla_oft(folder, statistics=config.real_size.statistics or None, device=device, **settings)
 
 
