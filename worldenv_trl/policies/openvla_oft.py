@@ -16,12 +16,12 @@ from worldenv_trl.policies.hf import HFConfig, HFPolicy
 from worldenv_trl.policies.hf_files import (
     check_kind,
     check_weights,
-    convert_command,
     local_folder,
     read_json,
     read_tokenizer,
 )
 from worldenv_trl.policies.prismatic import PrismaticConfig, PrismaticModel, dinosiglip_towers
+from worldenv_trl.weight_files import convert_command
 
 __all__ = ["load_openvla_oft"]
 
