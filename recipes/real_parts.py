@@ -10,12 +10,11 @@ import torch
 
 from config import WorldEnvConfig
 from libero_files import from_libero
-from parts import COMPACT, PROPRIO, Part, Parts, instructions
+from parts import COMPACT, PROPRIO, Part, Parts, cameras_of, instructions
 from worldenv_trl.policies import HFPolicy, Policy, load_openvla_oft
 from worldenv_trl.policies.hf_files import check_weights, read_json
 from worldenv_trl.reflectors import Reflector, VLMReflector, VLMReflectorConfig
 from worldenv_trl.reflectors.video_language_model import VideoLanguageModel
-from worldenv_trl.scenes import load_task
 from worldenv_trl.world_models import DiffusionWorldModel, DiffusionWorldModelConfig, WorldModel, load_diffusers
 
 NAMES = ("compact", "real-size")
@@ -93,10 +92,8 @@ def outlined_world_model(config: WorldEnvConfig, **sizes: Any) -> DiffusionWorld
 
 def world_model_config(config: WorldEnvConfig, **sizes: Any) -> DiffusionWorldModelConfig:
     """The run's cameras and sizes; ``sizes`` are the network's."""
-    tasks = [load_task(task) for task in config.tasks]
-    cameras = {name: {task.language: task.camera(name) for task in tasks} for name in config.cameras}
     return DiffusionWorldModelConfig.for_cameras(
-        cameras,
+        cameras_of(config),
         image_size=config.image_size,
         chunk_length=config.chunk_length,
         frame_size=config.real_size.frame_size,
