@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_run import SMALL
 
 import config
 import updates
@@ -27,23 +28,16 @@ from world_env import WORKS
 from worldenv_trl import keys
 
 SETTINGS = dataclasses.replace(
-    config.PRESETS["smoke"][1],
+    SMALL,
     device="cpu",
     checkpoint_minutes=1000.0,
-    num_threads=1,
-    tasks=config.GOAL_TASKS[1:2],
-    max_steps=16,
-    train_states=4,
-    demonstrate=config.Demonstrate(episodes_per_task=1),
     sft=config.SFT(steps=20, scale_steps=5, batch_size=8),
-    explore=config.Explore(episodes_per_task=8, num_envs=4, scale_factors=(1.0,)),
     world_model=config.WorldModel(steps=20, batch_size=2, lr=5e-4),
     reflector=config.Reflector(encoder_steps=20, steps=20, batch_size=4),
     post_train=config.PostTrain(
         iterations=5, groups=4, group_size=9, epochs=2, minibatch_size=36, probe_every=4, probe_contexts=2,
         contexts="mixed",
     ),
-    evaluate=config.Evaluate(episodes_per_task=2, num_envs=2),
 )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import json
 import pytest
 import torch
 from safetensors.torch import save_file
+from small_run import SMALL
 
 import config
 import fidelity
@@ -29,16 +30,10 @@ def run(tmp_path_factory):
     """A run as far as its world model."""
     path = tmp_path_factory.mktemp("fidelity") / "run"
     settings = dataclasses.replace(
-        config.PRESETS["smoke"][1],
+        SMALL,
         run_dir=path,
         device="cpu",
-        num_threads=1,
-        tasks=config.GOAL_TASKS[1:2],
         max_steps=24,
-        train_states=4,
-        demonstrate=config.Demonstrate(episodes_per_task=1),
-        sft=config.SFT(steps=3, scale_steps=2),
-        explore=config.Explore(episodes_per_task=8, num_envs=4, scale_factors=(1.0,)),
         world_model=config.WorldModel(steps=2, batch_size=2, holdout=0.5),
     )
     opened = open_run(settings)

@@ -29,7 +29,7 @@ def torchrun(jobs: list[dict], seconds: float = 400.0) -> subprocess.CompletedPr
     root = Path(__file__).parents[2]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     command += [str(Path(__file__).with_name("stages_together.py")), json.dumps(jobs)]
-    paths = [root, root / "recipes", os.environ.get("PYTHONPATH", "")]
+    paths = [root, root / "recipes", root / "tests", os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths)), "OMP_NUM_THREADS": "1"}
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=seconds, cwd=root)
 
