@@ -51,6 +51,9 @@ class DataParallel:
             self._call = make_loss(part)
         elif mode == "ddp":
             objective = _Objective(part, make_loss)
+            # A loss may leave parameters out, and which ones may change; torch looks for them, and complains of the
+            # search where all take part. One that no loss knows is always found.
+            objective.idle = nn.Parameter(torch.zeros((), device=device_of(part)))
             self._call = DistributedDataParallel(objective, forward_sync_buffers=False, find_unused_parameters=True)
         else:
             self._trained = copy.deepcopy(part)
