@@ -94,6 +94,17 @@ def test_two_processes_reach_the_weights_of_one_after_twenty_updates(one, two, k
     assert furthest(weights(one, stage), weights(two / kind, stage)) < 1e-5
 
 
+@pytest.mark.parametrize("rank", [0, 1])
+def test_beside_the_whole_part_a_process_holds_a_share_of_what_learns_alone(two, rank):
+    held = json.loads((two / "post_train" / f"held_{rank}.json").read_text())
+    assert held["learns"] < held["part"] / 2  # LOOP's adapters and heads: the rest is frozen
+    more = held["both"] - held["part"]
+    if two.name.startswith("ddp"):
+        assert more == 0
+    else:
+        assert 0 < more < 0.75 * held["learns"]  # half of it, but for what cannot be halved, and buffers
+
+
 @pytest.mark.parametrize(("kind", "stage"), STAGES.items())
 def test_figures_are_of_what_both_learned_from_and_logged_once(one, two, kind, stage):
     expected, found = lines(one, stage), lines(two / kind, stage)
