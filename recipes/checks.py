@@ -5,9 +5,11 @@ from __future__ import annotations
 from collecting import check_collectors
 from config import WorldEnvConfig
 from data_parallel import MODES
+from libero_files import check_files
 from loggers import check_loggers
 from parts import COMPACT, Parts
 from physics import tabletop
+from worldenv_trl.data import ACTIONS
 from worldenv_trl.devices import choose_device
 from worldenv_trl.policies import Policy, TokenPolicy
 from worldenv_trl.reflectors import StopRule
@@ -61,6 +63,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         ("post_train.contexts", config.post_train.contexts, ("uniform", "mixed")),
         ("post_train.ratio_level", config.post_train.ratio_level, ("step", "chunk", "token")),
         ("parallel", config.parallel, MODES),
+        ("demonstrate.actions", config.demonstrate.actions, ACTIONS),
     ):
         if value not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
@@ -136,6 +139,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         raise ValueError(f"max_steps must be a multiple of chunk_length={config.chunk_length}, got {config.max_steps}")
     check_loggers(config.logger)
     check_collectors(config)
+    check_files(config)
     digests: dict[str, str] = {}
     for name in config.tasks:
         digest = load_task(name).digest

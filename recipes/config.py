@@ -30,10 +30,13 @@ GOAL_SUITE = tuple(
 
 @dataclass(frozen=True)
 class Demonstrate:
-    """Scripted-expert demonstrations: the only supervised data."""
+    """Scripted-expert demonstrations, or LIBERO's where ``tasks`` names its files: the only supervised data."""
 
     episodes_per_task: int = 5
-    """Demonstrations per task, from the first training initial states."""
+    """Demonstrations per task: the expert's from the first training initial states, LIBERO's first successful ones."""
+    actions: str = "path"
+    """Of LIBERO's demonstrations: ``path``, what moves the hand along their path here, or ``stored``, the commands for
+    LIBERO's controller, which forward kinematics does not follow: then SFT is the last stage."""
 
 
 @dataclass(frozen=True)
@@ -225,7 +228,8 @@ class WorldEnvConfig:
     parts: str = "compact"
     """``compact``, made here, or ``real-size``: pretrained ones of the folders in ``real_size``."""
     tasks: tuple[str, ...] = GOAL_TASKS
-    """``suite/name`` or a ``.bddl`` file, each once; ``task_id`` is the place in this list."""
+    """``suite/name`` or a ``.bddl`` file, each once; ``task_id`` is the place in this list. LIBERO's ``_demo.hdf5``
+    files, or a folder of them, bring their demonstrations along."""
     cameras: tuple[str, ...] = ("agentview",)
     """Cameras that every part sees through: ``agentview``, ``wrist`` and any other that the scenes have."""
     image_size: int = 64

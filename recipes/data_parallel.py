@@ -24,7 +24,7 @@ import processes
 from worldenv_trl.devices import device_of
 
 MODES = ("ddp", "fsdp")
-_UNIT = 2**20  # parameters from which a layer of a list is gathered and freed by itself
+_UNIT = 2**20  # parameters that learn, from which a layer of a list is gathered and freed by itself
 
 Loss = Callable[[TensorDictBase], TensorDictBase]
 
@@ -32,8 +32,9 @@ Loss = Callable[[TensorDictBase], TensorDictBase]
 class DataParallel:
     """A part that is trained on batches of which every process holds some rows.
 
-    With ``fsdp`` a copy of the part is sharded and trained: ``part`` itself stays whole, for acting, and follows at
-    every :meth:`state_dict` and :meth:`gather`.
+    With ``fsdp`` a copy of what learns is sharded and trained: ``part`` itself stays whole, for acting, and follows at
+    every :meth:`state_dict` and :meth:`gather`. What is frozen is not copied, nor sharded, nor moved: acting needs it
+    whole in every process.
 
     Args:
         part: what is trained; the same weights in every process.
@@ -51,11 +52,16 @@ class DataParallel:
             self._call = make_loss(part)
         elif mode == "ddp":
             objective = _Objective(part, make_loss)
+            # A loss may leave parameters out, and which ones may change; torch looks for them, and complains of the
+            # search where all take part. One that no loss knows is always found.
+            objective.idle = nn.Parameter(torch.zeros((), device=device_of(part)))
             self._call = DistributedDataParallel(objective, forward_sync_buffers=False, find_unused_parameters=True)
         else:
-            self._trained = copy.deepcopy(part)
+            frozen = [parameter for parameter in part.parameters() if not parameter.requires_grad]
+            self._trained = copy.deepcopy(part, {id(parameter): parameter for parameter in frozen})
             for parameter in self._trained.parameters():
-                parameter.data = parameter.data.contiguous()  # channels last cannot be shared
+                if parameter.requires_grad:
+                    parameter.data = parameter.data.contiguous()  # channels last cannot be shared
             self._call = _sharded(_Objective(self._trained, make_loss))
 
     def __call__(self, batch: TensorDictBase) -> Any:
@@ -132,7 +138,8 @@ class DataParallel:
         if self._trained is not self.part:
             mine = dict(self._trained.named_parameters())
             for name, parameter in self.part.named_parameters():
-                mine[name].copy_(_like(parameter.detach(), mine[name]))
+                if mine[name] is not parameter:
+                    mine[name].copy_(_like(parameter.detach(), mine[name]))
 
     def state_dict(self) -> dict[str, Any]:
         """The part's, whole; to be asked for in all processes."""
@@ -195,13 +202,15 @@ class _Objective(nn.Module):
 
 
 def _sharded(objective: _Objective) -> _Objective:
-    """Lets each process hold a share of the parameters; scalars, which cannot be shared, whole."""
+    """Lets each process hold a share of what learns; scalars, which cannot be shared, whole."""
     mesh = init_device_mesh(device_of(objective).type, (processes.size(),))
-    options: dict[str, Any] = {"mesh": mesh, "ignored_params": set(_scalars(objective))}
+    frozen = {parameter for parameter in objective.parameters() if not parameter.requires_grad}
+    options: dict[str, Any] = {"mesh": mesh, "ignored_params": {*_scalars(objective), *frozen}}
     for module in reversed(list(objective.modules())):  # the inner ones first
         for layer in module if isinstance(module, nn.ModuleList) else ():
             called = not isinstance(layer, nn.ModuleList | nn.ModuleDict)
-            if called and sum(parameter.numel() for parameter in layer.parameters()) >= _UNIT:
+            learns = sum(parameter.numel() for parameter in layer.parameters() if parameter.requires_grad)
+            if called and learns >= _UNIT:
                 fully_shard(layer, **options)
     fully_shard(objective, **options)
     return objective

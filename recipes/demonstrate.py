@@ -1,4 +1,4 @@
-"""Scripted-expert demonstrations from the first training initial states.
+"""Scripted-expert demonstrations from the first training initial states, or those of LIBERO's files.
 
 Alone: ``python recipes/demonstrate.py improve --run-dir runs/improve``.
 """
@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from libero_files import convert, from_libero
 from physics import recording, tabletop
 from resumable import Outside, Resumable
 from resumable_recording import ResumableRecording
@@ -23,6 +24,9 @@ def demonstrate(run: Run) -> None:
     """Writes ``rollouts/demonstrations.mcap``; raises ``RuntimeError`` if the expert fails one."""
     config, folder = run.config, run.folder
     run.seed_everything("demonstrate")
+    if from_libero(config):
+        convert(run)
+        return
     count = config.demonstrate.episodes_per_task
     options = {"init_state_mode": "cycle", "terminate_on_success": True, "with_sim_state": True}
 

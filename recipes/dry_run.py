@@ -17,6 +17,7 @@ from checks import check_config
 from command_line import expected, in_options
 from config import WorldEnvConfig
 from gpus import GPUS
+from libero_files import told, with_files
 from parts import COMPACT, Parts
 from real_parts import parts_of
 from rehearsal import Rehearsal, rehearse
@@ -54,6 +55,7 @@ def split(arguments: Sequence[str]) -> tuple[argparse.Namespace | None, list[str
 def dry_run(config: WorldEnvConfig, chosen: argparse.Namespace, parts: Parts | None = None) -> int:
     """Prints the plan and, a line each, what does not fit; returns how many lines these are."""
     try:
+        config = with_files(config)
         parts = parts_of(config) if parts is None else parts
         machine = _machine(config, chosen)
         # Whether this machine has the run's device says nothing of another one; the parts are built below.
@@ -67,7 +69,7 @@ def dry_run(config: WorldEnvConfig, chosen: argparse.Namespace, parts: Parts | N
     found = rehearse(config, parts, published)
     for name in published:
         print(f"{_TITLES[name]}: no folder named (--real-size.{name.replace('_', '-')}), of published sizes")
-    for line in found.shapes:
+    for line in (*told(config), *found.shapes):
         print(line)
     if found.problems:
         return _refused(found.problems)

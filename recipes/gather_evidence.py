@@ -21,6 +21,7 @@ from worldenv_trl import keys
 from worldenv_trl.data import Episodes, episodes_from_rollouts
 from worldenv_trl.data.episodes import concatenated
 from worldenv_trl.devices import choose_device
+from worldenv_trl.hdf5_file import SUFFIXES
 from worldenv_trl.metrics import advantage_correlation, first_success, honesty, judged, moving_pixel_psnr
 from worldenv_trl.policies import policy_actor
 from worldenv_trl.record import read_rollouts
@@ -119,7 +120,7 @@ def read_config(record: RunRecord, num_threads: int, device: str = "auto") -> Wo
         try:
             load_task(task)
         except (ValueError, OSError) as error:
-            if task.endswith(".bddl") and not Path(task).exists():
+            if task.endswith((".bddl", *SUFFIXES)) and not Path(task).exists():
                 raise FileNotFoundError(
                     f"there is no task file {Path(task).resolve()}: the run was made with {task!r}; call this from the "
                     "folder that it was made from, or put the file there"

@@ -24,6 +24,7 @@ from worldenv_trl.reflectors import (
     PathReflectorConfig,
     Reflector,
 )
+from worldenv_trl.robot import Camera
 from worldenv_trl.scenes import load_task
 from worldenv_trl.vision import load_vision
 from worldenv_trl.world_models import VideoWorldModel, VideoWorldModelConfig, WorldModel
@@ -58,6 +59,12 @@ def instructions(config: WorldEnvConfig) -> tuple[str, ...]:
     return tuple(load_task(task).language for task in config.tasks)
 
 
+def cameras_of(config: WorldEnvConfig) -> dict[str, dict[str, Camera]]:
+    """Where each of the run's cameras stands, by its name and the instruction of the scene."""
+    tasks = [load_task(task) for task in config.tasks]
+    return {name: {task.language: task.camera(name) for task in tasks} for name in config.cameras}
+
+
 def make_policy(config: WorldEnvConfig) -> OFTPolicy:
     settings = config.sft
     policy = OFTPolicy(
@@ -80,11 +87,10 @@ def make_policy(config: WorldEnvConfig) -> OFTPolicy:
 
 def make_world_model(config: WorldEnvConfig) -> VideoWorldModel:
     settings = config.world_model
-    tasks = [load_task(task) for task in config.tasks]
     sizes: dict[str, Any] = {"image_size": config.image_size, "chunk_length": config.chunk_length}
     return VideoWorldModel(
         VideoWorldModelConfig.for_cameras(
-            {name: {task.language: task.camera(name) for task in tasks} for name in config.cameras},
+            cameras_of(config),
             patch=settings.patch,
             memory_stride=min(4, config.chunk_length),
             width=settings.width,

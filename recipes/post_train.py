@@ -9,13 +9,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import processes
+from averaging import RunningMean
 from data_parallel import DataParallel, WholeOptimizer
 from physics import exploring_actor, recording
 from probes import probe, probed_iterations, warning
@@ -82,8 +82,8 @@ def post_train(
     )
     full_rates = [group["lr"] for group in optimizer.param_groups]
     # Single iterations are noisy: what is probed and saved is a running mean of the weights they reach.
-    mean = AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(settings.averaging))
-    averaged = cast(Policy, mean.module)
+    mean = RunningMean(policy, settings.averaging)
+    averaged = mean.policy
     mean_actor = policy_actor(averaged)
 
     probed, recorded = probed_iterations(settings), {0, settings.iterations - 1}
@@ -122,7 +122,7 @@ def post_train(
                 wave[keys.ADVANTAGE] = _expanded(advantage, wave)
             wave.update(ratios(wave, read, make_loss(policy)))
             _write(run, f"{target}_{iteration:03d}", about, wave, waves.aside)
-        mean.update_parameters(policy)
+        mean.update()
         waves.update_policy_weights_()
 
         metrics |= _wave_metrics(mine, returns, config.tasks)

@@ -9,7 +9,8 @@ from typing import Any
 import torch
 
 from config import WorldEnvConfig
-from parts import COMPACT, PROPRIO, Part, Parts, instructions
+from libero_files import from_libero
+from parts import COMPACT, PROPRIO, Part, Parts, cameras_of, instructions
 from worldenv_trl.policies import (
     FlowPolicy,
     HFPolicy,
@@ -22,7 +23,6 @@ from worldenv_trl.policies import (
 from worldenv_trl.policies.hf_files import check_weights, read_json
 from worldenv_trl.reflectors import Reflector, VLMReflector, VLMReflectorConfig
 from worldenv_trl.reflectors.video_language_model import VideoLanguageModel
-from worldenv_trl.scenes import load_task
 from worldenv_trl.world_models import DiffusionWorldModel, DiffusionWorldModelConfig, WorldModel, load_diffusers
 
 NAMES = ("compact", "real-size")
@@ -69,6 +69,7 @@ def make_policy(config: WorldEnvConfig, device: str = "cpu") -> Policy:
                 f"{folder} was trained with 1 camera, got {len(settings['cameras'])} "
                 f"({', '.join(settings['cameras'])}): --sft.cameras {settings['cameras'][0]}"
             )
+        settings |= {"mirror": True, "fixed_statistics": not from_libero(config)}  # see below
         return load_openvla(folder, statistics=config.real_size.statistics or None, device=device, **settings)
     if not openvla:
         return HFPolicy.from_backbone(folder, device=device, chunk_length=config.chunk_length, **settings)
@@ -77,6 +78,9 @@ def make_policy(config: WorldEnvConfig, device: str = "cpu") -> Policy:
             f"{folder} was trained with 2 cameras, got {len(settings['cameras'])} ({', '.join(settings['cameras'])}): "
             "--cameras agentview wrist, and leave --sft.cameras out"
         )
+    # Its images were LIBERO's raw ones turned by 180 degrees: ours, which are upright, mirrored. Its bounds are of
+    # LIBERO's world and controller; those of the run's own demonstrations of LIBERO mean the same here.
+    settings |= {"mirror": True, "fixed_statistics": not from_libero(config)}
     return load_openvla_oft(folder, statistics=config.real_size.statistics or None, device=device, **settings)
 
 
@@ -139,10 +143,8 @@ def outlined_world_model(config: WorldEnvConfig, **sizes: Any) -> DiffusionWorld
 
 def world_model_config(config: WorldEnvConfig, **sizes: Any) -> DiffusionWorldModelConfig:
     """The run's cameras and sizes; ``sizes`` are the network's."""
-    tasks = [load_task(task) for task in config.tasks]
-    cameras = {name: {task.language: task.camera(name) for task in tasks} for name in config.cameras}
     return DiffusionWorldModelConfig.for_cameras(
-        cameras,
+        cameras_of(config),
         image_size=config.image_size,
         chunk_length=config.chunk_length,
         frame_size=config.real_size.frame_size,

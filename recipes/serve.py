@@ -73,7 +73,7 @@ def load_policy(checkpoint: str, device: torch.device, **released: Any) -> Polic
     described = read_json(folder, "config.json") if (folder / "config.json").is_file() else {}
     if described.get("model_type") == "openvla":
         release = load_openvla_oft if any(folder.glob("action_head--*")) else load_openvla
-        return release(folder, device=device)
+        return release(folder, device=device, mirror=True)  # it is asked with upright images
     if "input_features" in described:
         return load_lerobot(checkpoint, device=device, **released)
     for kind in (OFTPolicy, HFPolicy, HFTokenPolicy):

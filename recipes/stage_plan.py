@@ -45,14 +45,13 @@ class Held:
 
     size: Size
     learns: bool = False
-    copies: int = 1
-    """Of its weights: LOOP keeps a running mean of them."""
+    averaged: bool = False
+    """Whether LOOP's running mean holds what learns once more."""
 
     def bytes(self, shards: int) -> float:
         """A GPU's: its shard of weights, gradients and optimiser, and the layers that are gathered to compute."""
-        own = self.copies * self.size.weight_bytes + self.learns * (
-            self.size.gradient_bytes + self.size.optimizer_bytes
-        )
+        own = self.size.weight_bytes + self.learns * (self.size.gradient_bytes + self.size.optimizer_bytes)
+        own += self.averaged * self.size.gradient_bytes  # as large as the weights that they belong to
         return own if shards == 1 else own / shards + min(_GATHERED * self.size.layer_bytes, self.size.weight_bytes)
 
 
@@ -196,7 +195,7 @@ def _memory(kind: str, config: WorldEnvConfig, found: Rehearsal, machine: Machin
         pixels = len(config.sft.cameras or config.cameras) * 3 * config.image_size**2
         part = min(rows(settings.minibatch_size), rows_at_once(pixels, machine.kind))
         lived = max(videos * calls["decide"].activation_bytes, imagined(videos) if dreamed else 0.0)
-        held = [Held(sizes["policy"], learns=True, copies=2), *dreaming]
+        held = [Held(sizes["policy"], learns=True, averaged=True), *dreaming]
         return held, max(lived, part * calls["update"].activation_bytes)
     if kind == "evaluate":
         batch = rows(config.evaluate.num_envs)

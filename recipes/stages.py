@@ -19,6 +19,7 @@ import processes
 from checks import check_config, check_shares
 from command_line import expected, in_options, refusals
 from config import PRESETS, WorldEnvConfig
+from libero_files import from_libero, with_files
 from parts import Parts
 from real_parts import parts_of
 from run import Run
@@ -44,11 +45,15 @@ class Stage:
 
 
 def plan(config: WorldEnvConfig) -> list[Stage]:
-    """World-Env's Algorithm 1 as a list; a later round continues from the policy that the round before reached."""
+    """World-Env's Algorithm 1 as a list; a later round continues from the policy that the round before reached.
+
+    A policy of commands for LIBERO's controller acts there alone: SFT is the last stage."""
     stages = [
         Stage("demonstrate", "demonstrate", "rollouts/demonstrations.mcap"),
         Stage("sft", "sft", "checkpoints/sft"),
     ]
+    if from_libero(config) and config.demonstrate.actions == "stored":
+        return stages
     if config.post_train.env == "tabletop":  # the upper bound needs neither world model nor reflector
         learn = {"source": "sft", "target": "post_train", "models": ""}
         judge = {"before": "sft", "after": "post_train", "models": None}
@@ -120,6 +125,7 @@ def open_run(config: WorldEnvConfig, parts: Parts | None = None) -> Run:
     """The run of checked settings, with the parts that they name unless others are given; what is wrong is said in one
     line."""
     with refusals():
+        config = with_files(config)
         processes.join(config.device)
         chosen = parts_of(config) if parts is None else parts
         folder = RunFolder(config.run_dir)

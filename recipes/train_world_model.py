@@ -6,7 +6,6 @@ Alone: ``python recipes/train_world_model.py improve --run-dir runs/improve``.
 from __future__ import annotations
 
 import math
-import tempfile
 import time
 from typing import Any
 
@@ -15,15 +14,13 @@ import torch
 import processes
 from data_parallel import DataParallel, WholeOptimizer
 from episodes import demonstrations_and_exploration, split_by_context
+from fidelity import fidelity
 from resumable import Resumable
 from run import Run
 from stages import run_alone
-from worldenv_trl.data import Episodes, WindowBuffer, imagine_episodes, window_buffer
-from worldenv_trl.metrics import moving_pixel_psnr, psnr
+from worldenv_trl.data import Episodes, WindowBuffer, window_buffer
 from worldenv_trl.objectives import WorldModelLoss
 from worldenv_trl.world_models import WorldModel
-
-HORIZONS = (1, 20, 40, 56, 60)
 
 
 def train_world_model(run: Run, target: str = "world_model", previous: str | None = None, rounds: int = 1) -> None:
@@ -79,27 +76,6 @@ def _train(
             run.folder.log(target, step=step, loss=shown["loss"], steps_per_second=speed)
             progress.set_postfix(loss=f"{shown['loss']:.4f}")
     learner.close()
-
-
-def fidelity(run: Run, model: WorldModel, episodes: Episodes, seed: int) -> dict[str, float]:
-    """PSNR of open-loop imagination at some horizons, on all and on moving pixels, beside copying the first frame.
-
-    Figures of further cameras end in their names.
-    """
-    figures: dict[str, float] = {}
-    with tempfile.TemporaryDirectory(dir=run.folder.scratch) as scratch:
-        imagined = imagine_episodes(model, episodes, run.kinematics, seed=seed, folder=scratch)
-        for horizon in (horizon for horizon in HORIZONS if horizon <= episodes["actions"].shape[1]):
-            alive = (episodes["length"].squeeze(-1) >= horizon).nonzero().squeeze(-1)
-            for place, camera in enumerate(model.cameras if len(alive) else ()):
-                suffix = f"_{camera}" if place else ""
-                at = torch.full_like(alive, horizon)
-                real, first = episodes.frames(camera, alive, at), episodes.frames(camera, alive, torch.zeros_like(at))
-                for name, guess in (("model", imagined.frames(camera, alive, at)), ("copy", first)):
-                    figures[f"psnr_{name}_{horizon}{suffix}"] = psnr(guess, real).clamp(max=60).mean().item()
-                    moving = moving_pixel_psnr(guess, real, first).nanmean().item()
-                    figures[f"moving_psnr_{name}_{horizon}{suffix}"] = moving
-    return figures
 
 
 if __name__ == "__main__":

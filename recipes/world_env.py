@@ -29,7 +29,7 @@ from parts import Parts
 from post_train import post_train
 from run import Run
 from sft import fine_tune
-from stages import Work, open_run, parse, run_stages
+from stages import Work, open_run, parse, plan, run_stages
 from train_reflector import train_reflector
 from train_world_model import train_world_model
 from worldenv_trl.report import plot_run, summary_table
@@ -58,12 +58,17 @@ def _conclude(run: Run) -> None:
     loggers = run.folder.loggers
     loggers.images(plot_run(run.folder.path))
     summarize(run)
-    loggers.page(run.folder.path / "report.html")
+    page = run.folder.path / "report.html"
+    if page.exists():
+        loggers.page(page)
 
 
 def summarize(run: Run) -> None:
-    """Prints the table and writes the report."""
+    """Prints the table and writes the report, where the policy can be evaluated here."""
     config, folder = run.config, run.folder.path
+    if plan(config)[-1].kind != "evaluate":
+        print(f"{folder / 'checkpoints' / 'sft'}: its actions are for LIBERO's controller (recipes/README.md, LIBERO)")
+        return
     print(summary_table(folder))
     print(
         "Success in %, [95 % Wilson intervals], p of an exact McNemar test on the same initial states. "

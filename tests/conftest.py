@@ -20,20 +20,6 @@ torch.set_num_threads(1)  # test processes share the cores
 @pytest.fixture
 def tiny(tmp_path):
     """Settings of the whole loop at the smallest scale."""
-    import config
+    from small_run import SMALL
 
-    return dataclasses.replace(
-        config.PRESETS["smoke"][1],
-        run_dir=tmp_path / "run",
-        num_threads=1,
-        tasks=config.GOAL_TASKS[1:2],
-        max_steps=16,
-        train_states=4,
-        demonstrate=config.Demonstrate(episodes_per_task=1),
-        sft=config.SFT(steps=3, scale_steps=2),
-        explore=config.Explore(episodes_per_task=8, num_envs=4, scale_factors=(1.0,)),
-        world_model=config.WorldModel(steps=2, batch_size=2),
-        reflector=config.Reflector(encoder_steps=2, steps=2, batch_size=4),
-        post_train=config.PostTrain(iterations=1, groups=2, group_size=2, epochs=1, probe_contexts=2),
-        evaluate=config.Evaluate(episodes_per_task=2, num_envs=2),
-    )
+    return dataclasses.replace(SMALL, run_dir=tmp_path / "run")

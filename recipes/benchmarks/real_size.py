@@ -22,18 +22,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the recipes besi
 
 import torch
 import tyro
-from real_size_row import Costs, Row, Work, costs, empty, free, measured_call, measured_training
 from torch import nn
 
 from command_line import refusals
 from gpus import GPU, GPUS
+from real_size_row import Costs, Row, Work, costs, empty, free, measured_call, measured_training
 from speeds import matmul_bound
 from worldenv_trl.devices import choose_device
 
 Result = TypeVar("Result")
 
 FAMILIES = {"policy": "real_size_policy", "models": "real_size_models"}
-"""By the name of the part: the module beside this one whose ``ROWS`` are its rows."""
+"""By the name of the part: the module of the recipes whose ``ROWS`` are its rows."""
 
 
 @dataclass(frozen=True)

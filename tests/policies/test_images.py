@@ -57,6 +57,13 @@ def test_half_a_turn_swaps_both_axes_and_mean_and_deviation_are_each_channels():
         torch.testing.assert_close(out[channel], expected)
 
 
+def test_upright_images_mirrored_are_raw_ones_turned_by_half():
+    raw = torch.randint(0, 256, (2, 3, 6, 6), dtype=torch.uint8)  # as a renderer gives them: the last row is up
+    upright = raw.flip(-2)
+    turned, mirrored = prepare_images(raw, 6, rotation=180), prepare_images(upright, 6, mirror=True)
+    assert torch.equal(turned, mirrored) and not torch.equal(turned, prepare_images(upright, 6))
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [({"rotation": 45}, "multiple of 90 degrees, got 45"), ({"crop_area": 0.0}, r"lie in \(0, 1\], got 0.0")],

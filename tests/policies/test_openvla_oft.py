@@ -7,6 +7,7 @@ fork of transformers 4.40.1 and timm 0.9.16, at tiny sizes), its config and stat
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -126,6 +127,22 @@ def test_fine_tuning_on_other_data_keeps_the_bounds_that_the_heads_were_trained_
     low, high = (torch.tensor(REFERENCE["statistics"]["libero_tiny_no_noops"]["action"][q]) for q in ("q01", "q99"))
     torch.testing.assert_close(policy.action_range[:6], ((high - low) / 2)[:6])
     assert policy.action_range[6] == 1  # the gripper goes from -1 to +1
+
+
+def test_the_recipes_mirror_its_images_and_fit_its_bounds_to_liberos_files_alone(released, monkeypatch):
+    import config
+    import real_parts
+
+    settings = dataclasses.replace(
+        config.PRESETS["real-size"][1], real_size=config.RealSize(policy=released, dtype="float32")
+    )
+    for libero in (False, True):
+        monkeypatch.setattr(real_parts, "from_libero", lambda _, value=libero: value)
+        made = real_parts.make_policy(settings)
+        assert made.config.mirror and made.config.fixed_statistics is not libero
+        low = made.action_center.clone()
+        made.fit_statistics(torch.rand(64, 7), torch.rand(64, 8, 7))
+        assert torch.equal(low, made.action_center) is not libero
 
 
 def test_in_bfloat16_they_are_close(released):

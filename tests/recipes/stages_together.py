@@ -3,7 +3,8 @@
     torchrun --nproc-per-node 2 tests/recipes/stages_together.py JOBS
 
 JOBS is a JSON list of ``{"run": folder, "kind": of the stage, "settings": {...}, "kill": [rank, update]}``. What each
-process learned from goes to ``rows_<rank>.json`` in the folder.
+process learned from goes to ``rows_<rank>.json`` in the folder, the bytes it held of what it trained first to
+``held_<rank>.json``.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_run import SMALL
 
 import config
 import updates
@@ -27,23 +29,16 @@ from world_env import WORKS
 from worldenv_trl import keys
 
 SETTINGS = dataclasses.replace(
-    config.PRESETS["smoke"][1],
+    SMALL,
     device="cpu",
     checkpoint_minutes=1000.0,
-    num_threads=1,
-    tasks=config.GOAL_TASKS[1:2],
-    max_steps=16,
-    train_states=4,
-    demonstrate=config.Demonstrate(episodes_per_task=1),
     sft=config.SFT(steps=20, scale_steps=5, batch_size=8),
-    explore=config.Explore(episodes_per_task=8, num_envs=4, scale_factors=(1.0,)),
     world_model=config.WorldModel(steps=20, batch_size=2, lr=5e-4),
     reflector=config.Reflector(encoder_steps=20, steps=20, batch_size=4),
     post_train=config.PostTrain(
         iterations=5, groups=4, group_size=9, epochs=2, minibatch_size=36, probe_every=4, probe_contexts=2,
         contexts="mixed",
     ),
-    evaluate=config.Evaluate(episodes_per_task=2, num_envs=2),
 )  # fmt: skip
 
 
@@ -58,10 +53,21 @@ def learn(run, **options) -> None:
         post_train(run, **options, returns_of=returns_of)
 
 
+def _bytes(*modules: torch.nn.Module) -> int:
+    """That the parameters and buffers of modules take in this process, each storage once."""
+    tensors = [tensor for module in modules for tensor in (*module.parameters(), *module.buffers())]
+    storages = [getattr(tensor, "_local_tensor", tensor).untyped_storage() for tensor in tensors]
+    return sum({storage.data_ptr(): storage.nbytes() for storage in storages}.values())
+
+
 def work(run: str, kind: str, settings: dict, kill: list[int] | None = None) -> None:
-    rows, call, step = [], DataParallel.__call__, torch.optim.AdamW.step
+    rows, held, call, step = [], {}, DataParallel.__call__, torch.optim.AdamW.step
 
     def counted(self, batch):
+        if not held:
+            learns = [parameter for parameter in self.part.parameters() if parameter.requires_grad]
+            held.update(part=_bytes(self.part), both=_bytes(self.part, self._trained))
+            held["learns"] = sum(parameter.nbytes for parameter in learns)
         rows.append(len(batch))
         return call(self, batch)
 
@@ -78,7 +84,8 @@ def work(run: str, kind: str, settings: dict, kill: list[int] | None = None) -> 
                    for name, value in settings.items()}  # fmt: skip
         opened = open_run(dataclasses.replace(SETTINGS, run_dir=Path(run), **changed))
         rerun(kind, (WORKS | {"post_train": learn})[kind], opened)
-        (Path(run) / f"rows_{os.environ.get('RANK', 0)}.json").write_text(json.dumps(rows))
+        for name, found in (("rows", rows), ("held", held)):
+            (Path(run) / f"{name}_{os.environ.get('RANK', 0)}.json").write_text(json.dumps(found))
     finally:
         DataParallel.__call__, torch.optim.AdamW.step = call, step
 

@@ -29,7 +29,7 @@ def torchrun(jobs: list[dict], seconds: float = 400.0) -> subprocess.CompletedPr
     root = Path(__file__).parents[2]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     command += [str(Path(__file__).with_name("stages_together.py")), json.dumps(jobs)]
-    paths = [root, root / "recipes", os.environ.get("PYTHONPATH", "")]
+    paths = [root, root / "recipes", root / "tests", os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths)), "OMP_NUM_THREADS": "1"}
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=seconds, cwd=root)
 
@@ -68,6 +68,7 @@ def two(one, tmp_path_factory, request):
     jobs.append({"run": str(physics), "kind": "post_train", "settings": PHYSICS | {"parallel": request.param}})
     done = torchrun(jobs)
     assert done.returncode == 0, done.stderr[-4000:]
+    assert "find_unused_parameters" not in done.stderr  # torch's warning, once a process, where nothing is unused
     return root
 
 
@@ -91,6 +92,17 @@ def lines(run: Path, stage: str) -> list[dict]:
 @pytest.mark.parametrize(("kind", "stage"), STAGES.items())
 def test_two_processes_reach_the_weights_of_one_after_twenty_updates(one, two, kind, stage):
     assert furthest(weights(one, stage), weights(two / kind, stage)) < 1e-5
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_beside_the_whole_part_a_process_holds_a_share_of_what_learns_alone(two, rank):
+    held = json.loads((two / "post_train" / f"held_{rank}.json").read_text())
+    assert held["learns"] < held["part"] / 2  # LOOP's adapters and heads: the rest is frozen
+    more = held["both"] - held["part"]
+    if two.name.startswith("ddp"):
+        assert more == 0
+    else:
+        assert 0 < more < 0.75 * held["learns"]  # half of it, but for what cannot be halved, and buffers
 
 
 @pytest.mark.parametrize(("kind", "stage"), STAGES.items())

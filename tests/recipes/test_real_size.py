@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import pytest
 import torch
+from test_benchmarks import benchmark
 from torch import nn
 
-import show_scenes
-
-sys.path.append(str(Path(show_scenes.__file__).parent / "benchmarks"))  # last: some of its names are recipes, too
-
-import real_size
 from real_size_row import PeakMemory, Row, costs
 
+real_size = benchmark("real_size")
 WIDTH, DEPTH = 64, 3
 
 

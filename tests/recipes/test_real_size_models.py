@@ -11,15 +11,15 @@ import torch
 pytest.importorskip("diffusers")
 pytest.importorskip("transformers")
 
-import show_scenes
+sys.path.append(str(Path(__file__).parents[1] / "world_models"))
 
-sys.path.insert(0, str(Path(show_scenes.__file__).parent / "benchmarks"))
-sys.path.insert(0, str(Path(__file__).parents[1] / "world_models"))
+from small_diffusion import SMALL
+from test_benchmarks import benchmark
 
-import real_size
 import real_size_models
 from real_size_row import costs
-from small_diffusion import SMALL
+
+real_size = benchmark("real_size")
 
 VISION = {
     "model_type": "siglip_vision_model", "hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1,

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_run import SMALL
 
 import config
 from post_train import post_train
@@ -24,21 +25,14 @@ from worldenv_trl.record import read_rollouts
 from worldenv_trl.reflectors import PathReflector
 
 SETTINGS = dataclasses.replace(
-    config.PRESETS["smoke"][1],
+    SMALL,
     checkpoint_minutes=1000.0,
-    num_threads=1,
-    tasks=config.GOAL_TASKS[1:2],
-    max_steps=16,
-    train_states=4,
-    demonstrate=config.Demonstrate(episodes_per_task=1),
     sft=config.SFT(steps=4, scale_steps=3, batch_size=8),
-    explore=config.Explore(episodes_per_task=8, num_envs=4, scale_factors=(1.0,)),
     world_model=config.WorldModel(steps=4, batch_size=2),
     reflector=config.Reflector(encoder_steps=3, steps=3, batch_size=4),
     post_train=config.PostTrain(
         iterations=3, groups=2, group_size=2, epochs=1, probe_every=1, probe_contexts=2, contexts="mixed"
     ),
-    evaluate=config.Evaluate(episodes_per_task=2, num_envs=2),
 )
 
 

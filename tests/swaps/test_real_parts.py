@@ -19,21 +19,18 @@ from small_diffusion import SMALL
 from test_recipe import VISION_LANGUAGE
 from tiny_vlm import save_tiny_vlm
 
-from parts import COMPACT, Part, instructions
+from parts import COMPACT, Part, cameras_of, instructions
 from run_folder import RunFolder
 from stages import plan
 from world_env import run_all
 from worldenv_trl.record import read_metadata
 from worldenv_trl.reflectors import VLMLessons, VLMReflector, VLMReflectorConfig
-from worldenv_trl.scenes import load_task
 from worldenv_trl.world_models import DiffusionWorldModel, DiffusionWorldModelConfig
 
 
 def make_world_model(config) -> DiffusionWorldModel:
-    tasks = [load_task(task) for task in config.tasks]
-    cameras = {name: {task.language: task.camera(name) for task in tasks} for name in config.cameras}
     sizes = {"image_size": config.image_size, "chunk_length": config.chunk_length, "num_denoise_steps": 1}
-    return DiffusionWorldModel(DiffusionWorldModelConfig.for_cameras(cameras, **{**SMALL, **sizes}))
+    return DiffusionWorldModel(DiffusionWorldModelConfig.for_cameras(cameras_of(config), **{**SMALL, **sizes}))
 
 
 @pytest.mark.parametrize("cameras", [("agentview",), ("agentview", "wrist")])

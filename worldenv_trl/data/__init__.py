@@ -6,25 +6,30 @@ from worldenv_trl.data.hdf5 import hdf5_to_mcap, read_hdf5
 from worldenv_trl.data.imagine import ImaginedSoFar, imagine_episodes
 from worldenv_trl.data.lerobot import write_lerobot
 from worldenv_trl.data.lerobot_reader import read_lerobot
+from worldenv_trl.data.libero import ACTIONS, LiberoFile, inspect_libero, read_libero
 from worldenv_trl.data.samples import policy_samples
 from worldenv_trl.data.score import score_episodes
 from worldenv_trl.data.store import fill_store, open_store
 from worldenv_trl.data.windows import WindowBuffer, WindowSampler, predicted_poses, window_buffer
 
 __all__ = [
+    "ACTIONS",
     "Episodes",
     "ImaginedSoFar",
+    "LiberoFile",
     "WindowBuffer",
     "WindowSampler",
     "episodes_from_rollouts",
     "fill_store",
     "hdf5_to_mcap",
     "imagine_episodes",
+    "inspect_libero",
     "open_store",
     "policy_samples",
     "predicted_poses",
     "read_hdf5",
     "read_lerobot",
+    "read_libero",
     "score_episodes",
     "window_buffer",
     "write_lerobot",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,15 +12,16 @@ import numpy as np
 import torch
 from tensordict import NonTensorData, TensorDict
 
-from worldenv_trl.keys import ACTION, INSTRUCTION, MASK, STATE, SUCCESS
+from worldenv_trl.hdf5_file import demonstration_names, demonstrations_of, open_hdf5, text_of
+from worldenv_trl.keys import ACTION, IMAGE, INSTRUCTION, MASK, STATE, SUCCESS, image_key
 
 __all__ = ["hdf5_to_mcap", "read_hdf5"]
 
 _CAMERAS = {
-    "agentview_rgb": "image",
-    "agentview_image": "image",
-    "eye_in_hand_rgb": "wrist_image",
-    "robot0_eye_in_hand_image": "wrist_image",
+    "agentview_rgb": "agentview",
+    "agentview_image": "agentview",
+    "eye_in_hand_rgb": "wrist",
+    "robot0_eye_in_hand_image": "wrist",
 }
 _OPEN = 0.04  # metres that each finger of LIBERO's and robomimic's Panda travels
 
@@ -49,11 +49,10 @@ def read_hdf5(path: str | os.PathLike, *, alignment: str = "stored") -> Iterator
     """
     if alignment not in ("stored", "executed"):
         raise ValueError(f"alignment must be 'stored' or 'executed', got {alignment!r}")
-    h5py = _h5py()
-    with _opened(path, h5py) as file:
-        data = _data(file, path)
-        said, flip = _instruction(data, path), _bottom_up(data)
-        for name in _names(data):
+    with open_hdf5(path) as file:
+        data = demonstrations_of(file, path)
+        said, flip = _instruction(data, path), bottom_up(data)
+        for name in demonstration_names(data):
             yield _rollout(data[name], f"{path}:{name}", said, flip, alignment)
 
 
@@ -63,12 +62,11 @@ def hdf5_to_mcap(
     """Writes the demonstrations of an HDF5 file into a recording; returns how many. Raises as :func:`read_hdf5`."""
     from worldenv_trl.record import RolloutWriter
 
-    h5py = _h5py()
-    with _opened(source, h5py) as file:
-        data = _data(file, source)
-        attributes = {key: _text(value) for key, value in data.attrs.items()}
-        names = _names(data)
-        model = _text(data[names[0]].attrs["model_file"]) if "model_file" in data[names[0]].attrs else None
+    with open_hdf5(source) as file:
+        data = demonstrations_of(file, source)
+        attributes = {key: text_of(value) for key, value in data.attrs.items()}
+        names = demonstration_names(data)
+        model = text_of(data[names[0]].attrs["model_file"]) if "model_file" in data[names[0]].attrs else None
     task = Path(attributes.get("bddl_file_name", Path(source).stem)).stem.removesuffix("_demo")
     attachments = {"0.bddl": attributes.pop("bddl_file_content", None), "0.mjcf": model}
     metadata = {"task": task, "source": Path(source).name, "alignment": alignment, "demonstrations": names}
@@ -85,43 +83,9 @@ def hdf5_to_mcap(
     return count
 
 
-def _h5py() -> Any:
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError("HDF5 files need h5py: pip install worldenv_trl[data]") from error
-    return h5py
-
-
-def _opened(path: str | os.PathLike, h5py: Any) -> Any:
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"there is no file {path}")
-    try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        raise ValueError(f"{path} is not a readable HDF5 file: {error}") from error
-
-
-def _data(file: Any, path: str | os.PathLike) -> Any:
-    if "data" not in file or not _names(file["data"]):
-        raise ValueError(f"{path} holds no demonstrations: a robomimic or LIBERO file has groups data/demo_0, ...")
-    return file["data"]
-
-
-def _names(data: Any) -> list[str]:
-    found = [name for name in data if re.fullmatch(r"demo_\d+", name)]
-    return sorted(found, key=lambda name: int(name[5:]))
-
-
-def _text(value: Any) -> Any:
-    if isinstance(value, bytes):
-        return value.decode()
-    return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
-
-
 def _json(data: Any, name: str) -> dict[str, Any]:
     try:
-        value = json.loads(_text(data.attrs.get(name, "{}")))
+        value = json.loads(text_of(data.attrs.get(name, "{}")))
     except (json.JSONDecodeError, TypeError):
         return {}
     return value if isinstance(value, dict) else {}
@@ -133,8 +97,15 @@ def _instruction(data: Any, path: str | os.PathLike) -> str:
     return (said or Path(path).stem.removesuffix("_demo").replace("_", " ")).strip().strip('"')
 
 
-def _bottom_up(data: Any) -> bool:
-    return _text(data.attrs.get("macros_image_convention", "opencv")) == "opengl"
+def bottom_up(data: Any) -> bool:
+    """Whether the rows of its images run upwards: as the file says or, where it does not, in LIBERO's alone.
+
+    What OpenVLA-OFT's script makes of LIBERO's files says nothing and holds the renderer's rows as they came.
+    """
+    said = data.attrs.get("macros_image_convention")
+    if said is not None:
+        return bool(text_of(said) == "opengl")
+    return "agentview_rgb" in data[demonstration_names(data)[0]].get("obs", ())
 
 
 def _rollout(demo: Any, where: str, said: str, flip: bool, alignment: str) -> TensorDict:
@@ -176,18 +147,28 @@ def _column(demo: Any, name: str, rows: int, skip: int) -> torch.Tensor:
     return torch.from_numpy(np.asarray(demo[name], np.float32))[skip:].reshape(1, rows, 1)
 
 
+def images_of(obs: Any) -> dict[str, str]:
+    """What the images of a scene's camera are called, by camera."""
+    return {camera: name for name, camera in _CAMERAS.items() if name in obs}
+
+
+def opening_of(fingers: Any) -> torch.Tensor:
+    """How far the gripper is open, [T, 1] in [0, 1], from where both fingers are [T, 2] (m)."""
+    opening = np.abs(np.asarray(fingers, np.float64)).mean(-1, keepdims=True) / _OPEN
+    return torch.from_numpy(opening.astype(np.float32)).clamp(0, 1)
+
+
 def _observed(obs: Any, where: str, length: int, flip: bool) -> dict[tuple[str, ...], torch.Tensor]:
     """Observations [T, ...] by key."""
     found: dict[tuple[str, ...], torch.Tensor] = {}
-    for name, target in _CAMERAS.items():
-        if name in obs:
-            frames = np.asarray(obs[name])
-            if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
-                raise ValueError(f"{where}: obs/{name} must be uint8 [T, H, W, 3], got {frames.dtype} {frames.shape}")
-            frames = frames[:, ::-1] if flip else frames
-            frames = np.ascontiguousarray(frames.transpose(0, 3, 1, 2))
-            found["observation", target] = torch.from_numpy(frames)
-    if ("observation", "image") not in found:
+    for camera, name in images_of(obs).items():
+        frames = np.asarray(obs[name])
+        if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
+            raise ValueError(f"{where}: obs/{name} must be uint8 [T, H, W, 3], got {frames.dtype} {frames.shape}")
+        frames = frames[:, ::-1] if flip else frames
+        frames = np.ascontiguousarray(frames.transpose(0, 3, 1, 2))
+        found[image_key(camera)] = torch.from_numpy(frames)
+    if IMAGE not in found:
         raise ValueError(f"{where} holds no images of the agent's view: it has {', '.join(obs)}")
     found[STATE] = _state(obs, where)
     wrong = {key: len(value) for key, value in found.items() if len(value) != length}
@@ -207,9 +188,8 @@ def _state(obs: Any, where: str) -> torch.Tensor:
         raise ValueError(f"{where} holds neither ee_pos and ee_ori nor robot0_eef_pos and robot0_eef_quat")
     if fingers is None:
         raise ValueError(f"{where} holds neither gripper_states nor robot0_gripper_qpos")
-    opening = np.abs(np.asarray(fingers, np.float64)).mean(-1, keepdims=True) / _OPEN
-    state = np.concatenate([np.asarray(position, np.float64), rotation, np.clip(opening, 0, 1)], -1)
-    return torch.from_numpy(state.astype(np.float32))
+    pose = np.concatenate([np.asarray(position, np.float64), rotation], -1)
+    return torch.cat([torch.from_numpy(pose.astype(np.float32)), opening_of(fingers)], -1)
 
 
 def _axis_angle(quaternion: np.ndarray) -> np.ndarray:

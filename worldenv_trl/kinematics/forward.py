@@ -138,6 +138,14 @@ class ForwardKinematics(nn.Module):
         rotation = pose[..., 3:12].reshape(*pose.shape[:-1], 3, 3)
         return torch.cat([pose[..., :3], _axis_angle(rotation), pose[..., 12:]], -1)
 
+    def path_actions(self, kinematic_states: Tensor) -> Tensor:
+        """The poses' part [*B, T, 6] of the actions that take the target from each of the states [*B, T + 1, 20] to the
+        next one; beyond [-1, 1] where that is further than an action goes."""
+        before, after = kinematic_states[..., :-1, 7:19], kinematic_states[..., 1:, 7:19]
+        turned = after[..., 3:].unflatten(-1, (3, 3)) @ before[..., 3:].unflatten(-1, (3, 3)).mT
+        turn = _log(turned.reshape(-1, 3, 3)).reshape(*before.shape[:-1], 3)
+        return torch.cat([(after[..., :3] - before[..., :3]) / POSITION_STEP, turn / ROTATION_STEP], -1)
+
     def initial_state(self, q: Tensor, opening: float = 1.0) -> Tensor:
         """The kinematic state [*B, 20] at rest at joints [*B, 7]: the target is where the hand is."""
         state = torch.cat([q, q.new_zeros(*q.shape[:-1], 12), q.new_full((*q.shape[:-1], 1), opening)], -1)

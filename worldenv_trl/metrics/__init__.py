@@ -5,8 +5,10 @@ from worldenv_trl.metrics.alarm import HonestyAlarm
 from worldenv_trl.metrics.calibration import calibration_slope, expected_calibration_error
 from worldenv_trl.metrics.classification import Classification, classification
 from worldenv_trl.metrics.drift import drift
+from worldenv_trl.metrics.frechet import frechet_distance, load_video_features, video_features
 from worldenv_trl.metrics.groups import Estimate, group_bootstrap, group_correlations, group_slope
 from worldenv_trl.metrics.honesty import advantage_correlation, honesty, rank_correlation
+from worldenv_trl.metrics.perceptual import LPIPS
 from worldenv_trl.metrics.stopping import (
     choose_rule,
     first_success,
@@ -20,6 +22,7 @@ from worldenv_trl.metrics.success import paired_test, wilson_interval
 from worldenv_trl.metrics.video import moving_pixel_psnr, psnr, ssim
 
 __all__ = [
+    "LPIPS",
     "Classification",
     "Estimate",
     "HonestyAlarm",
@@ -32,12 +35,14 @@ __all__ = [
     "expected_calibration_error",
     "first_success",
     "frame_figures",
+    "frechet_distance",
     "group_bootstrap",
     "group_correlations",
     "group_slope",
     "honesty",
     "judged",
     "largest_scores",
+    "load_video_features",
     "loop_returns",
     "moving_pixel_psnr",
     "paired_test",
@@ -47,5 +52,6 @@ __all__ = [
     "recall",
     "ssim",
     "stop_figures",
+    "video_features",
     "wilson_interval",
 ]

@@ -28,8 +28,8 @@ class HFConfig(VisionLanguageConfig):
     """What an :class:`HFPolicy` is made of, and trained for.
 
     Args:
-        backbone, instructions, cameras, image_size, chunk_length, proprio, resolution, rotation, crop_area, image_mean,
-            image_std, prompt, prompt_end, proprio_format, fixed_statistics, lora_rank, lora_alpha, dtype,
+        backbone, instructions, cameras, image_size, chunk_length, proprio, resolution, rotation, mirror, crop_area,
+            image_mean, image_std, prompt, prompt_end, proprio_format, fixed_statistics, lora_rank, lora_alpha, dtype,
             gradient_checkpointing: see :class:`~worldenv_trl.policies.vision_language.VisionLanguageConfig`.
         attention: ``prefix`` or ``full``; see :class:`~worldenv_trl.policies.hf_backbone.VisionLanguageBackbone`.
         stop_id: of a token behind the placeholders; none when -1.

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from worldenv_trl import hub
+from worldenv_trl.weight_files import convert_command
 
 if TYPE_CHECKING:
     from tokenizers import Tokenizer
@@ -148,13 +149,3 @@ def check_weights(folder: Path, pattern: str = "*.safetensors") -> list[Path]:
             "trust where they are from, convert them once: " + convert_command(folder / pickled[0])
         )
     raise FileNotFoundError(f"{folder} holds no weights: {pattern} is missing")
-
-
-def convert_command(path: Path) -> str:
-    """The shell command that writes a pickled state dict as safetensors, reading nothing but tensors from it."""
-    target = path.with_suffix(".safetensors")
-    return (
-        f'python -c "import torch; from safetensors.torch import save_file; state = torch.load({str(path)!r}, '
-        f"weights_only=True, map_location='cpu'); save_file({{k: v.contiguous().clone() for k, v in state.items()}}, "
-        f'{str(target)!r})"'
-    )

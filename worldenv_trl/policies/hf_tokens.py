@@ -32,8 +32,8 @@ class HFTokenConfig(VisionLanguageConfig):
     """What an :class:`HFTokenPolicy` is made of, and trained for.
 
     Args:
-        backbone, instructions, cameras, image_size, chunk_length, proprio, resolution, rotation, crop_area, image_mean,
-            image_std, prompt_end, proprio_format, fixed_statistics, lora_rank, lora_alpha, dtype,
+        backbone, instructions, cameras, image_size, chunk_length, proprio, resolution, rotation, mirror, crop_area,
+            image_mean, image_std, prompt_end, proprio_format, fixed_statistics, lora_rank, lora_alpha, dtype,
             gradient_checkpointing: see :class:`~worldenv_trl.policies.vision_language.VisionLanguageConfig`.
         prompt: with ``{instruction}``, and with ``{state}`` where the policy is to know proprioception: its numbers, as
             the bins 0 to 255 that they fall into, stand there in words (pi0-FAST, pi0.5). OpenVLA knows none.

@@ -18,6 +18,7 @@ def prepare_images(
     size_px: int,
     *,
     rotation: int = 0,
+    mirror: bool = False,
     crop_area: float = 1.0,
     mean: Sequence[float] = (0.5, 0.5, 0.5),
     std: Sequence[float] = (0.5, 0.5, 0.5),
@@ -30,6 +31,8 @@ def prepare_images(
 
     Keyword Args:
         rotation: degrees against the clock, a multiple of 90. LIBERO's raw images need 180.
+        mirror: exchange left and right after that. Upright images mirrored are LIBERO's raw ones, whose rows run
+            upwards, turned by 180.
         crop_area: share of the area that the centre crop keeps; it is brought back to ``size_px``. 1 crops nothing.
         mean, std: of each channel, of values in [0, 1].
 
@@ -46,6 +49,8 @@ def prepare_images(
         raise ValueError(f"crop_area must lie in (0, 1], got {crop_area}")
     if rotation % 360:
         images = torch.rot90(images, rotation // 90, (-2, -1))
+    if mirror:
+        images = images.flip(-1)
     pixels = lanczos_resize(images, size_px)
     if crop_area < 1:
         pixels = centre_crop(pixels, crop_area)

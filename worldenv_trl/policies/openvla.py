@@ -39,7 +39,8 @@ def load_openvla(
     Actions come out in this package's convention: the checkpoint's gripper, 0 closed and 1 open, becomes +1 closed and
     -1 open; position and rotation are in the units of its data set, which are ours for LIBERO's alone. Where the
     reference takes the likeliest token of the whole vocabulary, only action tokens can be drawn. Images must be as
-    LIBERO's data set shows them to the checkpoint; ``rotation=180`` turns the simulator's raw ones. Checkpoints that
+    LIBERO's data set shows them to the checkpoint: ``mirror=True`` makes them of upright ones, ``rotation=180`` of the
+    simulator's raw ones. Checkpoints that
     were trained without random crops need ``crop_area=1.0``.
 
     Args:

@@ -15,7 +15,6 @@ from worldenv_trl.policies.hf import HFConfig, HFPolicy
 from worldenv_trl.policies.hf_files import (
     check_kind,
     check_weights,
-    convert_command,
     local_folder,
     read_json,
     read_tokenizer,
@@ -27,6 +26,7 @@ from worldenv_trl.policies.openvla_files import (
     read_prismatic,
     read_tensors,
 )
+from worldenv_trl.weight_files import convert_command
 
 __all__ = ["load_openvla_oft"]
 
@@ -47,7 +47,7 @@ def load_openvla_oft(
     Backbone, action head, projector of proprioception and statistics are the checkpoint's. The scale head is new, for
     OpenVLA-OFT has none: train it before LOOP. Actions come out in this package's convention: the checkpoint's gripper,
     0 closed and 1 open, becomes +1 closed and -1 open. Images must be as LIBERO's data set shows them to the
-    checkpoint; ``rotation=180`` turns the simulator's raw ones.
+    checkpoint: ``mirror=True`` makes them of upright ones, ``rotation=180`` of the simulator's raw ones.
 
     Args:
         folder: with ``config.json``, the backbone's safetensors, ``action_head--*_checkpoint.safetensors`` and

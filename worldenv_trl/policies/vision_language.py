@@ -47,6 +47,7 @@ class VisionLanguageConfig:
         proprio: what the state tells, ``commanded`` or ``measured``.
         resolution: side of the images that the backbone sees (px); that of its vision config when 0.
         rotation: of the env's images, in degrees against the clock, before all else.
+        mirror: exchange left and right, after the rotation: what a checkpoint of LIBERO learned from.
         crop_area: share of each image's area that is kept, its middle; OpenVLA-OFT keeps 0.9.
         image_mean, image_std: of each channel, as the backbone was pretrained.
         prompt: with ``{instruction}``, which is put in lower case.
@@ -72,6 +73,7 @@ class VisionLanguageConfig:
     proprio: str = "commanded"
     resolution: int = 0
     rotation: int = 0
+    mirror: bool = False
     crop_area: float = 0.9
     image_mean: tuple[float, ...] = (0.5, 0.5, 0.5)
     image_std: tuple[float, ...] = (0.5, 0.5, 0.5)
@@ -281,6 +283,7 @@ class VisionLanguagePolicy(Policy, Pretrained):
             torch.stack([images[camera] for camera in self.cameras], 1),
             config.resolution,
             rotation=config.rotation,
+            mirror=config.mirror,
             crop_area=config.crop_area,
             mean=config.image_mean,
             std=config.image_std,

@@ -6,7 +6,9 @@ import difflib
 from functools import cache
 from pathlib import Path
 
+from worldenv_trl.hdf5_file import SUFFIXES
 from worldenv_trl.scenes.files import FileTask, load_bddl
+from worldenv_trl.scenes.libero import load_libero
 
 __all__ = ["SUITES_FOLDER", "list_suites", "list_tasks", "load_task"]
 
@@ -28,7 +30,7 @@ def list_tasks(suite: str) -> list[str]:
 
 
 def load_task(name: str | Path) -> FileTask:
-    """The task called ``suite/name``, or that of a file ``path.bddl``.
+    """The task called ``suite/name``, or that of a file ``path.bddl`` or of LIBERO's demonstrations, ``path.hdf5``.
 
     Its standard initial states are those stored beside the file, ``path.npz``, if there are any
     (``recipes/init_states.py`` makes them); all others are drawn when they are asked for.
@@ -37,11 +39,14 @@ def load_task(name: str | Path) -> FileTask:
         TypeError: for what is no name.
         ValueError: with the closest names for an unknown task; for a file that cannot be read, laid out or judged.
         FileNotFoundError: if there is no such file.
+        ImportError: for demonstrations, without h5py.
     """
     if not isinstance(name, str | Path):
         raise TypeError(f"a task is called by its name or file, got {name!r}: try 'starter/open_the_top_drawer'")
     if str(name).endswith(".bddl"):
         return load_bddl(name, states=Path(name).with_suffix(".npz"))
+    if str(name).endswith(SUFFIXES):
+        return load_libero(name)
     if name in _MAX_STEPS:
         raise ValueError(f"{name!r} is a suite: name tasks of it, for instance {list_tasks(str(name))[0]!r}")
     if name not in _known():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -21,7 +22,7 @@ from worldenv_trl.scenes.settings import compile_scene, setting_of
 from worldenv_trl.scenes.simulation import SceneBatch
 from worldenv_trl.scenes.tasks import Task
 
-__all__ = ["FileTask", "load_bddl"]
+__all__ = ["FileTask", "load_bddl", "task_of"]
 
 MAX_STEPS = 300  # LIBERO's goal suite, in openvla-oft's protocol
 
@@ -100,17 +101,35 @@ def load_bddl(
         ValueError: if it names an unknown problem class, category, region or joint.
     """
     path = Path(path)
-    problem = read_bddl(path)
+    return task_of(
+        read_bddl(path), name=str(path) if name is None else name, suite=suite, max_steps=max_steps, states=states
+    )
+
+
+def task_of(
+    problem: Problem,
+    *,
+    name: str,
+    suite: str = "file",
+    max_steps: int = MAX_STEPS,
+    states: Path | None = None,
+    **other: Any,
+) -> FileTask:
+    """The task of a problem; ``other`` are fields of it that its text does not decide.
+
+    Raises:
+        ValueError: if the problem names an unknown problem class, category, region or joint.
+    """
+    fields: dict[str, Any] = {"language": problem.language, "cameras": (setting_of(problem).camera, WRIST)} | other
     task = FileTask(
-        name=str(path) if name is None else name,
+        name=name,
         suite=suite,
-        language=problem.language,
         goal=problem.goal,
         max_steps=max_steps,
-        cameras=(setting_of(problem).camera, WRIST),
         digest=problem.digest,
         states=states,
         problem=problem,
+        **fields,
     )
     _layout(task), _relations(task)  # what cannot be laid out or judged fails here, not in the first reset
     return task

@@ -181,9 +181,10 @@ def _scene_files(task: Task) -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as folder:
         # MuJoCo writes the text of the model that it compiled last, and tasks keep theirs: compile it once more.
         path = Path(folder) / "scene.xml"
-        mujoco.mj_saveLastXML(str(path), compile_scene(task.problem)[1])
+        mujoco.mj_saveLastXML(str(path), compile_scene(task.problem, task.cameras)[1])
         files["mjcf"] = path.read_bytes()
-    files["bddl"] = Path(task.problem.source).read_bytes()
+    if task.suite != "libero":  # there the BDDL alone is not the task: its words and camera are the data set's
+        files["bddl"] = Path(task.problem.source).read_bytes()
     return files
 
 

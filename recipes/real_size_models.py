@@ -6,12 +6,12 @@ from functools import partial
 from typing import Any
 
 import torch
-from real_size_row import Row
 from tensordict import TensorDict
 from torch import Tensor, nn
 from transformers import AutoModelForImageTextToText
 
 from published_sizes import INSTRUCTION, QWEN2_7B, WordTokens, llava_onevision
+from real_size_row import Row
 from worldenv_trl import keys
 from worldenv_trl.language import instructions_of
 from worldenv_trl.reflectors import VLMReflector, VLMReflectorConfig

@@ -26,19 +26,19 @@ class Row:
     unit: str
     """What one row of a call's batch is: ``decision``, ``imagined frame``, ``score``."""
     make: Callable[[], nn.Module]
-    inputs: Callable[[nn.Module, int], Any]
+    inputs: Callable[[Any, int], Any]
     """Of that many rows, on the module's device; random or zero."""
-    call: Callable[[nn.Module, Any], Any]
-    train: Callable[[nn.Module], Iterable[nn.Parameter]]
+    call: Callable[[Any, Any], Any]
+    train: Callable[[Any], Iterable[nn.Parameter]]
     """Freezes and prepares (adapters, gradient checkpointing) and returns what learns."""
-    loss: Callable[[nn.Module, Any], Tensor]
-    compile: Callable[[nn.Module], None] = nn.Module.compile
+    loss: Callable[[Any, Any], Tensor]
+    compile: Callable[[Any], None] = nn.Module.compile
     """In place; of many equal layers, one by one is quicker than the whole."""
     call_batches: tuple[int, ...] = (1, 8)
     train_batch: int = 4
     units_per_row: int = 1
     """How many units one row is: frames of an imagined chunk."""
-    read_again: Callable[[nn.Module], int] = lambda module: 0
+    read_again: Callable[[Any], int] = lambda module: 0
     """Bytes of the parameters that a call reads more than once, each time counted but the first."""
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import partial
 
 import torch
-from real_size_row import Row
 from torch import Tensor, nn
 from transformers import LlavaConfig, PaliGemmaConfig, PretrainedConfig, SmolVLMConfig
 
 from published_sizes import INSTRUCTION, LLAMA_2_7B, openvla_oft_7b, words
+from real_size_row import Row
 from worldenv_trl.keys import ACTION_DIM, STATE_DIM
 from worldenv_trl.policies import HFConfig, HFPolicy, HFTokenConfig, HFTokenPolicy, Policy, token_cross_entropy
 from worldenv_trl.policies.prismatic import PrismaticConfig
