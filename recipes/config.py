@@ -283,8 +283,8 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
             train_states=150,
             sft=SFT(vision_blocks=(2, 4, 10)),
             explore=Explore(episodes_per_task=480),
-            reflector=Reflector(choose_threshold=True),
-            post_train=PostTrain(iterations=40),
+            reflector=Reflector(choose_threshold=True, path_steps=800),
+            post_train=PostTrain(iterations=36, lora_rank=0, lora_lr=5e-5, head_lr=5e-5),
         ),
     ),
     "real-size": (

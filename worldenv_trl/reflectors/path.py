@@ -100,8 +100,8 @@ class PathReflector(Reflector, Pretrained):
     Every ``stride`` frames it looks at the first frame around the point where the hand is then: what will be under the
     fingers was seen sharply once, before the hand covered it. Causal convolutions over these looks and the hand's
     poses, and mean and maximum of what they say so far, give R of every prefix. It learns from real rollouts which path
-    fails in which scene, and reads nothing that a world model paints, so a world model that paints successes cannot
-    mislead it; what happens otherwise than commanded it does not see either. A hand view is what others predict as a
+    fails in which scene, and reads nothing that a world model paints, so ghosts of success cannot mislead it; what
+    happens otherwise than commanded it does not see either. A hand view is what others predict as a
     second camera (Ctrl-World, 2510.10125); success told for every frame is the reward head of World-VLA-Loop
     (2602.06508).
 
