@@ -252,9 +252,13 @@ def _judge(found: Rehearsal, config: WorldEnvConfig, made: dict[str, Any]) -> No
         found.shapes.append(f"reflector: {_shape(video)} -> tokens {_shape(tokens)} -> scores {_shape(made['scores'])}")
         return
     found.sizes["reflector"] = size(reflector)
-    state = reflector.begin({camera: each[:, 0] for camera, each in frames.items()}, texts)
+    imagined = reflector.for_world("imagined")
+    frames = {camera: frames[camera] for camera in imagined.cameras}
+    if imagined.reads_path:
+        frames[keys.KINEMATIC_STATES] = torch.zeros(ROWS, config.chunk_length, keys.KINEMATIC_DIM, device=device)
+    state = imagined.begin({name: each[:, 0] for name, each in frames.items()}, texts)
     found.kept_bytes = sum(each[0].numel() * each.element_size() for each in state.values() if isinstance(each, Tensor))
-    judge = counted(reflector, ROWS, lambda: made.update(scores=reflector.extend(state, frames)[1]))
+    judge = counted(imagined, ROWS, lambda: made.update(scores=imagined.extend(state, frames)[1]))
     found.calls["see"], found.calls["judge"] = Call(0.0, 0.0), judge
     found.calls["learn"] = _lessons(reflector, config)
     found.shapes.append(f"reflector: {_shape(next(iter(frames.values())))} -> scores {_shape(made['scores'])}")
@@ -272,6 +276,7 @@ def _lessons(reflector: Reflector, config: WorldEnvConfig) -> Call:
     success = (torch.arange(length) > length // 2) & (torch.arange(count).unsqueeze(-1) % 4 < 2)
     entries = {"actions": torch.zeros(count, length - 1, keys.ACTION_DIM), "success": success, keys.TASK_ID: task}
     entries["length"] = torch.full((count, 1), length - 1)
+    entries["kinematic_states"] = torch.zeros(count, length, keys.KINEMATIC_DIM)
     episodes = Episodes(
         TensorDict(entries, batch_size=[count]), [texts[row % len(texts)] for row in range(count)], shown
     )

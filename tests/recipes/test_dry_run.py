@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 import dry_run as dry
 import world_env
-from parts import COMPACT, make_policy
+from parts import COMPACT, make_policy, make_reflector
 from rehearsal import rehearse
 from worldenv_trl import keys
 
@@ -63,3 +65,18 @@ def test_costs_of_the_compact_policy_are_what_torch_counts(tiny):
     assert found.calls["decide"].flops == pytest.approx(counter.get_total_flops() / 5, rel=0.05)
     assert found.sizes["policy"].trainable < found.sizes["policy"].parameters
     assert found.sizes["sft"].trainable == found.sizes["sft"].parameters
+
+
+def test_of_two_judges_the_one_of_imagination_is_counted_there_and_both_learn(tiny):
+    settings = dataclasses.replace(tiny, reflector=dataclasses.replace(tiny.reflector, path_steps=2))
+    video, both = rehearse(tiny, COMPACT), rehearse(settings, COMPACT)
+    assert not both.problems
+    assert both.sizes["reflector"].parameters > video.sizes["reflector"].parameters
+    assert both.calls["learn"].flops > video.calls["learn"].flops
+    reflector, chunk = make_reflector(settings).path.eval(), tiny.chunk_length
+    path, texts = torch.zeros(5, chunk + 1, keys.KINEMATIC_DIM), ["open the top drawer of the cabinet"] * 5
+    first = {"agentview": torch.zeros(5, 3, 64, 64, dtype=torch.uint8), keys.KINEMATIC_STATES: path[:, 0]}
+    state = reflector.begin(first, texts)
+    with FlopCounterMode(display=False) as counter:
+        reflector.extend(state, {keys.KINEMATIC_STATES: path[:, 1:]})
+    assert both.calls["judge"].flops == pytest.approx(counter.get_total_flops() / 5, rel=0.05)
