@@ -50,6 +50,8 @@ class Rehearsal:
     """That the reflector keeps of every frame of a video, or where ``learn`` is known of a video."""
     judgements: int = 1
     """Of a chunk."""
+    judge_reads_video: bool = True
+    """In imagination; where not, no episodes are imagined for the reflector."""
     rows_imagined: int = 1
     """At once."""
 
@@ -253,6 +255,7 @@ def _judge(found: Rehearsal, config: WorldEnvConfig, made: dict[str, Any]) -> No
         return
     found.sizes["reflector"] = size(reflector)
     imagined = reflector.for_world("imagined")
+    found.judge_reads_video = imagined.reads_video
     frames = {camera: frames[camera] for camera in imagined.cameras}
     if imagined.reads_path:
         frames[keys.KINEMATIC_STATES] = torch.zeros(ROWS, config.chunk_length, keys.KINEMATIC_DIM, device=device)

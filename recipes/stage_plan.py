@@ -135,7 +135,9 @@ def stage_flops(kind: str, config: WorldEnvConfig, found: Rehearsal, *, refit: b
     if kind == "train_reflector":
         kept, share = config.reflector.holdout * episodes, config.reflector.imagined_share
         imagined = min(1.0, share / max(1e-6, 1 - share)) * (episodes - kept)
-        flops = (imagined + kept) * length * calls["imagine"].flops + 2 * kept * length * judged_flops(config, found)
+        imagined *= found.judge_reads_video
+        painted = (imagined + kept) * length * found.judge_reads_video
+        flops = painted * calls["imagine"].flops + 2 * kept * length * judged_flops(config, found)
         if "learn" in calls:
             return flops + calls["learn"].flops
         taught = config.demonstrate.episodes_per_task * tasks + episodes - kept + imagined
