@@ -96,7 +96,7 @@ def _curve(axes: plt.Axes, worlds: TwoWorlds, row: int, task: str, steps: torch.
     length = int(worlds.episodes["length"][row]) + 1
     for scores, colour, name in (
         (worlds.real_scores, REAL, "R on real frames"),
-        (worlds.imagined_scores, IMAGINED, "R on imagined frames"),
+        (worlds.imagined_scores, IMAGINED, "R in imagination"),
     ):
         axes.plot(scores[row, :length].numpy(), color=colour, lw=1.4, label=name)
     reached = int(worlds.reached[row])

@@ -92,7 +92,7 @@ def metrics(folder: RunFolder, stage: str) -> list[str]:
         ("sft", "torch.Tensor.backward", 4, "sft: l1 continues after step 2 of 4"),
         ("sft", "torch.Tensor.backward", 7, "sft: nll continues after step 2 of 3"),
         ("train_world_model", "torch.Tensor.backward", 4, "world_model: steps continues after step 2 of 4"),
-        ("train_world_model", "train_world_model.psnr", 1, "world_model: steps was finished"),
+        ("train_world_model", "train_world_model.fidelity", 1, "world_model: steps was finished"),
         ("train_reflector", "train_reflector.learn", 1, "reflector: imagines held out was finished"),
         ("train_reflector", "torch.Tensor.backward", 3, "reflector: 0_encoder continues after step 2 of 3"),
         ("train_reflector", "torch.Tensor.backward", 6, "reflector: 1_head continues after step 2 of 3"),

@@ -13,13 +13,13 @@ from torch import Tensor, nn
 
 from worldenv_trl.keys import KINEMATIC_STATES, POSE_DIM
 from worldenv_trl.kinematics import ActionMap, ForwardKinematics
+from worldenv_trl.kinematics.calibrations import Calibrations, check_instructions, plain_cameras
 from worldenv_trl.language import Vocabulary
 from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.reflectors.base import Lesson, Reflector
 from worldenv_trl.reflectors.goal import MAX_WORDS, Goal
 from worldenv_trl.reflectors.path_lessons import PathLessons, lessons_of
 from worldenv_trl.robot.camera import Camera
-from worldenv_trl.world_models.calibrations import Calibrations, check_instructions, plain_cameras
 
 if TYPE_CHECKING:
     from worldenv_trl.data import Episodes

@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from worldenv_trl.kinematics import ActionMap
+from worldenv_trl.kinematics.calibrations import Calibrations
 from worldenv_trl.world_models.base import PADDED_ACTION_DIM
-from worldenv_trl.world_models.calibrations import Calibrations
 from worldenv_trl.world_models.diffusion_config import DiffusionWorldModelConfig
 
 __all__ = ["ContextTokens", "ViewGeometry"]

@@ -10,8 +10,8 @@ from typing import Any
 
 import torch
 
+from worldenv_trl.kinematics.calibrations import plain_cameras
 from worldenv_trl.robot.camera import Camera
-from worldenv_trl.world_models.calibrations import plain_cameras
 
 __all__ = ["CONDITION_CHANNELS", "DiffusionWorldModelConfig"]
 

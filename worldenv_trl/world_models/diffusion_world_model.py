@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from worldenv_trl.keys import CONTROL_HZ, NOISE_SEED, POSE_DIM, frames_key
+from worldenv_trl.kinematics.calibrations import Calibrations, check_instructions
 from worldenv_trl.language import instructions_of
 from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.world_models.base import (
@@ -22,7 +23,6 @@ from worldenv_trl.world_models.base import (
     WorldModel,
     memory_key,
 )
-from worldenv_trl.world_models.calibrations import Calibrations, check_instructions
 from worldenv_trl.world_models.cells import to_float, to_uint8
 from worldenv_trl.world_models.diffusion_conditioning import ContextTokens, ViewGeometry, resized
 from worldenv_trl.world_models.diffusion_config import CONDITION_CHANNELS, DiffusionWorldModelConfig

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from worldenv_trl.keys import CHUNK_LENGTH, NOISE_SEED, POSE_DIM, frames_key
 from worldenv_trl.kinematics import ActionMap
+from worldenv_trl.kinematics.calibrations import Calibrations, check_instructions, plain_cameras
 from worldenv_trl.language import instructions_of
 from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.robot.camera import Camera
@@ -24,7 +25,6 @@ from worldenv_trl.world_models.base import (
     memory_key,
     reference_key,
 )
-from worldenv_trl.world_models.calibrations import Calibrations, check_instructions, plain_cameras
 from worldenv_trl.world_models.cells import from_cells, to_cells, to_float, to_uint8
 from worldenv_trl.world_models.denoiser import Denoiser, View
 from worldenv_trl.world_models.flow_matching import sample, seeded_noise
