@@ -99,6 +99,8 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             raise ValueError(f"{name} must be at least 1, got {count}")
     if config.seed < 0:
         raise ValueError(f"seed must be a whole number of at least 0, got {config.seed}")
+    if config.reflector.path_steps < 0:
+        raise ValueError(f"reflector.path_steps must be at least 0, got {config.reflector.path_steps}")
     if not 0 <= config.checkpoint_minutes < float("inf"):
         raise ValueError(f"checkpoint_minutes must be at least 0, got {config.checkpoint_minutes}")
     if config.post_train.group_size < 2:

@@ -118,9 +118,16 @@ def make_reflector(config: WorldEnvConfig) -> CompactReflector | DualReflector:
     )
     reflector: CompactReflector | DualReflector = CompactReflector(video, lessons)
     if settings.path_steps:
-        tasks = [load_task(task) for task in config.tasks]
-        fixed = [name for name in config.cameras if all(task.camera(name).mount == "world" for task in tasks)]
-        cameras = {name: {task.language: task.camera(name) for task in tasks} for name in fixed}
+        cameras = {
+            name: views
+            for name, views in cameras_of(config).items()
+            if all(camera.mount == "world" for camera in views.values())
+        }
+        if not cameras:
+            raise ValueError(
+                "reflector.path_steps needs a camera that is fixed in the world, got cameras "
+                f"{', '.join(config.cameras)}: add agentview, or set it to 0"
+            )
         path = PathReflectorConfig.for_cameras(cameras, image_size=config.image_size)
         reflector = DualReflector(
             DualReflectorConfig(video, path), lessons, PathLessons(steps=settings.path_steps, lr=settings.lr)

@@ -47,6 +47,11 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"tasks": GOAL_TASKS[:1] * 2}, "names a task twice"),
         ({"rounds": 0}, "rounds must be at least 1, got 0"),
         ({"world_model": WorldModel(failure_share=1.5)}, "world_model.failure_share must lie between 0 and 1, got 1.5"),
+        ({"reflector": Reflector(path_steps=-1)}, "reflector.path_steps must be at least 0, got -1"),
+        (
+            {"reflector": Reflector(path_steps=1), "cameras": ("wrist",)},
+            "reflector.path_steps needs a camera that is fixed in the world, got cameras wrist",
+        ),
         ({"train_states": 0}, "train_states must be at least 1, got 0"),
         ({"num_threads": 0}, "num_threads must be at least 1"),
         ({"demonstrate": Demonstrate(episodes_per_task=0)}, "demonstrate.episodes_per_task must be at least 1"),

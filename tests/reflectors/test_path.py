@@ -158,6 +158,15 @@ def test_it_learns_from_the_first_frame_and_the_path_whether_the_goal_is_reached
     assert lost.float().mean() < right.float().mean() - 0.15  # it is the block that it looks at
 
 
+def test_the_loss_of_a_batch_is_the_mean_of_its_episodes():
+    reflector, episodes = make(lessons=PathLessons(steps=1, batch_size=8)), touching(8, 0)
+    (lesson,) = reflector.train_on(episodes)
+    batch = lesson.sample()
+    batch["weight"][3, 2:] = 0  # an episode that ended early
+    each = [reflector.training_loss(batch[row : row + 1])["loss_reflector"] for row in range(8)]
+    torch.testing.assert_close(reflector.training_loss(batch)["loss_reflector"], torch.stack(each).mean())
+
+
 def test_later_frames_are_not_looked_at():
     reflector, episodes = make(), touching(4, 0)
     before = score_episodes(reflector, episodes)

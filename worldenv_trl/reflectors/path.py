@@ -258,7 +258,8 @@ class PathReflector(Reflector, Pretrained):
         return lessons_of(self, episodes)
 
     def training_loss(self, batch: TensorDictBase) -> TensorDict:
-        """Binary cross-entropy of "reached by then", mean over the looks of an episode, and again of its last look.
+        """Binary cross-entropy of "reached by then": that of an episode's looks in the mean and that of its last one added,
+        mean over episodes.
 
         Args:
             batch: [P] with ``crops`` floats [P, L, 3 V, S, S], ``path`` [P, L, 26], ``words`` int64 [P, W], ``label``
@@ -270,8 +271,8 @@ class PathReflector(Reflector, Pretrained):
         each = F.binary_cross_entropy_with_logits(logits, label.unsqueeze(-1).expand_as(logits), reduction="none")
         last = (weight.sum(1).long() - 1).clamp(min=0)
         rows = torch.arange(len(last), device=last.device)
-        dense = (each * weight.unsqueeze(-1)).sum((0, 1)) / weight.sum()
-        loss = (dense + each[rows, last].mean(0)).sum()  # members learn on their own
+        dense = (each * weight.unsqueeze(-1)).sum(1) / weight.sum(1, keepdim=True)
+        loss = (dense + each[rows, last]).mean(0).sum()  # members learn on their own
         right = (logits.detach()[rows, last].sigmoid().mean(-1) > 0.5) == (label[rows, last] > 0.5)
         return TensorDict({"loss_reflector": loss, "accuracy": right.float().mean()})
 
