@@ -258,8 +258,8 @@ class PathReflector(Reflector, Pretrained):
         return lessons_of(self, episodes)
 
     def training_loss(self, batch: TensorDictBase) -> TensorDict:
-        """Binary cross-entropy of "reached by then": that of an episode's looks in the mean and that of its last one added,
-        mean over episodes.
+        """Binary cross-entropy of "reached by then": of an episode the mean over its looks plus that of the last one, of a batch
+        the mean over its episodes.
 
         Args:
             batch: [P] with ``crops`` floats [P, L, 3 V, S, S], ``path`` [P, L, 26], ``words`` int64 [P, W], ``label``
