@@ -258,8 +258,7 @@ class PathReflector(Reflector, Pretrained):
         return lessons_of(self, episodes)
 
     def training_loss(self, batch: TensorDictBase) -> TensorDict:
-        """Binary cross-entropy of "reached by then": of an episode the mean over its looks plus that of the last one, of a batch
-        the mean over its episodes.
+        """Binary cross-entropy of "reached by then", mean over episodes of the mean over looks plus that of the last.
 
         Args:
             batch: [P] with ``crops`` floats [P, L, 3 V, S, S], ``path`` [P, L, 26], ``words`` int64 [P, W], ``label``
