@@ -63,7 +63,7 @@ def check_solved(task: str, solved: torch.Tensor) -> None:
     if not solved.all():
         raise RuntimeError(
             f"the expert solved {int(solved.sum())} of {len(solved)} demonstrations of {task}: "
-            "give it more --max-steps, or see where it fails with recipes/show_scenes.py"
+            "give it more --max-steps in another --run-dir, or see where it fails with recipes/show_scenes.py"
         )
 
 

@@ -41,7 +41,7 @@ class ResumableRecording:
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         if not RolloutWriter.still_holds(self.path, state_dict):
-            raise ValueError(f"{self.path} is cut short, damaged or gone")
+            raise ValueError(f"what was recorded of {self.path} is cut short, damaged or gone")
         if self._writer is not None:
             self._writer.__exit__(ValueError)
         self._writer, self._state = None, state_dict

@@ -141,7 +141,10 @@ def test_what_is_cut_short_is_collected_again(run, straight, monkeypatch, capsys
     told = [line for line in capsys.readouterr().err.replace("\r", "\n").splitlines() if line.startswith("warning")]
     assert len(told) == warnings
     for line in told:
-        assert f"warning: {run.folder.rollouts('explore')} is cut short, damaged or gone, which scale_0-" in line
+        assert (
+            f"warning: what was recorded of {run.folder.rollouts('explore')} is cut short, damaged or gone, which scale_0-"
+            in line
+        )
     assert result(run, "explore") == straight
 
 
