@@ -140,11 +140,9 @@ def test_what_is_cut_short_is_collected_again(run, straight, monkeypatch, capsys
     rerun("explore", explore, run)
     told = [line for line in capsys.readouterr().err.replace("\r", "\n").splitlines() if line.startswith("warning")]
     assert len(told) == warnings
+    lost = f"warning: what was recorded of {run.folder.rollouts('explore')} is cut short, damaged or gone"
     for line in told:
-        assert (
-            f"warning: what was recorded of {run.folder.rollouts('explore')} is cut short, damaged or gone, which scale_0-"
-            in line
-        )
+        assert f"{lost}, which scale_0-" in line
     assert result(run, "explore") == straight
 
 
