@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -25,6 +26,11 @@ if TYPE_CHECKING:
     from torch.nn import Module as _Module  # it stands beside one
 else:
     _Module = object
+
+
+def with_tuples(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a JSON object as a config has them: lists are tuples; what lies deeper stays as it is."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()}
 
 
 class OtherClassError(ValueError):

@@ -30,7 +30,8 @@ def score_episodes(reflector: Reflector, episodes: Episodes, *, rows_at_once: in
     device, parts = device_of(reflector), []
 
     def shown(rows: Tensor, steps: Tensor) -> dict[str, Tensor]:
-        frames = {camera: episodes.frames(camera, rows, steps).to(device) for camera in reflector.cameras}
+        looked_at = reflector.cameras if reflector.reads_video or not steps.any() else ()
+        frames = {camera: episodes.frames(camera, rows, steps).to(device) for camera in looked_at}
         if reflector.reads_path:
             frames[KINEMATIC_STATES] = episodes["kinematic_states"][rows, steps].to(device)
         return frames

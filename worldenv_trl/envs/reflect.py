@@ -150,9 +150,8 @@ class Reflect(Transform):
 
     def _frames(self, shown: TensorDictBase, rows: Tensor, chunk: bool) -> dict[str, Tensor]:
         """What the reflector reads of the new frames of ``rows``: uint8 [n, C, 3, H, W] by camera, and the path."""
-        keys: dict[str, tuple[Any, Any]] = {
-            camera: (frames_key(camera), image_key(camera)) for camera in self.reflector.cameras
-        }
+        looked_at = self.reflector.cameras if self.reflector.reads_video else ()
+        keys: dict[str, tuple[Any, Any]] = {camera: (frames_key(camera), image_key(camera)) for camera in looked_at}
         if self.reflector.reads_path:
             keys[KINEMATIC_STATES] = (KINEMATIC_STATES, KINEMATIC_STATE)
         frames = {}

@@ -7,7 +7,13 @@ from typing import Any
 import torch
 from torch import nn
 
-__all__ = ["inject_adapters"]
+__all__ = ["check_adapters", "inject_adapters"]
+
+
+def check_adapters(rank: int, alpha: int) -> None:
+    """Raises ``ValueError`` for a config's ``lora_rank`` or ``lora_alpha`` below 0."""
+    if rank < 0 or alpha < 0:
+        raise ValueError(f"lora_rank and lora_alpha must not be negative, got {rank}, {alpha}")
 
 
 def inject_adapters(network: nn.Module, rank: int, alpha: int, dtype: torch.dtype) -> None:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from worldenv_trl.keys import ACTION_DIM, CHUNK_LENGTH, STATE_DIM
-from worldenv_trl.policies.adapters import inject_adapters
+from worldenv_trl.policies.adapters import check_adapters, inject_adapters
 from worldenv_trl.policies.base import Policy, check_rank
 from worldenv_trl.policies.flow_network import FLOW_FAMILIES, FlowNetwork
 from worldenv_trl.policies.flow_prompts import Prompts
@@ -22,7 +22,7 @@ from worldenv_trl.policies.heads import MLPResNet
 from worldenv_trl.policies.hf_backbone import FAMILIES, autocast, backbone_config, make_model
 from worldenv_trl.policies.images import bilinear_resize
 from worldenv_trl.policies.proprio import libero_proprio
-from worldenv_trl.pretrained import Pretrained
+from worldenv_trl.pretrained import Pretrained, with_tuples
 
 if TYPE_CHECKING:
     from tokenizers import Tokenizer
@@ -128,8 +128,7 @@ class FlowConfig:
                 f"max_action_dim must be at least {ACTION_DIM} and max_state_dim {self.proprio_dim}, got "
                 f"{self.max_action_dim} and {self.max_state_dim}"
             )
-        if self.lora_rank < 0 or self.lora_alpha < 0:
-            raise ValueError(f"lora_rank and lora_alpha must not be negative, got {self.lora_rank}, {self.lora_alpha}")
+        check_adapters(self.lora_rank, self.lora_alpha)
 
     @property
     def proprio_dim(self) -> int:
@@ -138,11 +137,7 @@ class FlowConfig:
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> Self:
-        """Of a JSON object; the backbone's lists stay lists."""
-        plain: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()
-        }
-        return cls(**plain)
+        return cls(**with_tuples(fields))
 
 
 class FlowPolicy(Policy, Pretrained):

@@ -16,6 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from worldenv_trl.pretrained import with_tuples
+
 if TYPE_CHECKING:
     from transformers import PreTrainedConfig
 
@@ -82,8 +84,7 @@ class PrismaticConfig:
 
 
 def _tower(fields: Mapping[str, Any]) -> TowerConfig:
-    plain: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()}
-    return TowerConfig(**plain)
+    return TowerConfig(**with_tuples(fields))
 
 
 class _Gain(nn.Module):

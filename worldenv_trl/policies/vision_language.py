@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import functools
 import json
 import os
@@ -14,12 +15,12 @@ import torch
 from torch import Tensor, nn
 
 from worldenv_trl.keys import CHUNK_LENGTH, STATE_DIM
-from worldenv_trl.policies.adapters import inject_adapters
+from worldenv_trl.policies.adapters import check_adapters, inject_adapters
 from worldenv_trl.policies.base import Policy, check_rank
 from worldenv_trl.policies.hf_backbone import FAMILIES, backbone_config, make_model
 from worldenv_trl.policies.images import prepare_images
 from worldenv_trl.policies.proprio import libero_proprio
-from worldenv_trl.pretrained import Pretrained
+from worldenv_trl.pretrained import Pretrained, with_tuples
 
 if TYPE_CHECKING:
     from tokenizers import Tokenizer
@@ -102,16 +103,11 @@ class VisionLanguageConfig:
             raise ValueError(f"dtype must be 'float32' or 'bfloat16', got {self.dtype!r}")
         if "{instruction}" not in self.prompt:
             raise ValueError(f"prompt must hold {{instruction}}, got {self.prompt!r}")
-        if self.lora_rank < 0 or self.lora_alpha < 0:
-            raise ValueError(f"lora_rank and lora_alpha must not be negative, got {self.lora_rank}, {self.lora_alpha}")
+        check_adapters(self.lora_rank, self.lora_alpha)
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> Self:
-        """Of a JSON object; the backbone's lists stay lists."""
-        plain: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()
-        }
-        return cls(**plain)
+        return cls(**with_tuples(fields))
 
 
 class VisionLanguagePolicy(Policy, Pretrained):
@@ -174,12 +170,13 @@ class VisionLanguagePolicy(Policy, Pretrained):
     def take_output_embeddings(self, rows: Tensor) -> None:
         """What a pretrained model's language head is made of, [vocabulary, dim], for those who read tokens out."""
 
+    @abc.abstractmethod
     def head_parameters(self) -> list[nn.Parameter]:
         """What learns in full beside the backbone."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def _set_action_bounds(self, center: Tensor, half: Tensor) -> None:
-        raise NotImplementedError
+        """Takes middle and half range of the actions, [7] each."""
 
     # ------------------------------------------------------------------------------------------------- building
 

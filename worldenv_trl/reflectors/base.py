@@ -113,7 +113,8 @@ class Reflector(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def extend(self, state: TensorDictBase, frames: Mapping[str, Tensor]) -> tuple[TensorDict, Tensor]:
-        """The state after the next C frames, uint8 [n, C, 3, H, W] by camera, and R after each of them, [n, C].
+        """The state after the next C frames, uint8 [n, C, 3, H, W] by camera (none for one that reads no video), and R
+        after each of them, [n, C].
 
         The scores of a video are the same in whatever pieces its frames come. ``state`` itself is not changed; the new
         one has the same entries.
