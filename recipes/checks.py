@@ -120,9 +120,16 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         ("world_model.holdout", config.world_model.holdout),
         ("reflector.imagined_share", config.reflector.imagined_share),
         ("reflector.holdout", config.reflector.holdout),
+        ("post_train.branch_share", config.post_train.branch_share),
     ):
         if share is not None and not 0 <= share <= 1:
             raise ValueError(f"{name} must lie between 0 and 1, got {share}")
+    latest = config.post_train.branch_until
+    if config.post_train.branch_share and not config.chunk_length <= latest < config.max_steps:
+        raise ValueError(
+            f"post_train.branch_until must be at least {config.chunk_length}, chunk_length, and below "
+            f"{config.max_steps}, max_steps, got {latest}"
+        )
     if not 0 < config.post_train.false_alarm_rate < 1:
         raise ValueError(
             f"post_train.false_alarm_rate must lie between 0 and 1, got {config.post_train.false_alarm_rate}"

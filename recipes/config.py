@@ -131,6 +131,11 @@ class PostTrain:
     contexts: str = "uniform"
     """``uniform`` (each context as often as any other of its task) or ``mixed`` (more often where the returns of a
     group are expected to differ: groups that all succeed or all fail teach nothing)."""
+    branch_share: float = 0.0
+    """Share of the groups that begin in imagination in the middle of an explored episode, on its real frames, instead
+    of at an initial state. Waves that are recorded have none: they are relived in the physics."""
+    branch_until: int = 40
+    """The last step at which they begin."""
     epochs: int = 4
     minibatch_size: int = 256
     clip_epsilon: float = 0.1
@@ -284,7 +289,7 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
             sft=SFT(vision_blocks=(2, 4, 10)),
             explore=Explore(episodes_per_task=480),
             reflector=Reflector(choose_threshold=True, path_steps=800),
-            post_train=PostTrain(iterations=36, lora_rank=0, lora_lr=5e-5, head_lr=5e-5),
+            post_train=PostTrain(iterations=36, lora_rank=0, lora_lr=5e-5, head_lr=5e-5, branch_share=0.6),
         ),
     ),
     "real-size": (

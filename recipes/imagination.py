@@ -16,8 +16,9 @@ from episodes import demonstrations_and_exploration
 from parts import PROPRIO
 from run import Run
 from worldenv_trl import keys
+from worldenv_trl.data import Episodes
 from worldenv_trl.devices import to_device
-from worldenv_trl.envs import ContextSampler, FramesAside, ImaginedEnv, Reflect
+from worldenv_trl.envs import BranchPoints, ContextSampler, FramesAside, ImaginedEnv, Reflect
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.row_texts import row_texts
@@ -26,20 +27,31 @@ from worldenv_trl.world_models import WorldModel
 
 @dataclass(frozen=True)
 class Imagination:
-    """A world model, its judge and where rollouts begin."""
+    """A world model, its judge, and where rollouts begin: at contexts, or at branch points where that is asked for."""
 
     world_model: WorldModel
     reflector: Reflector
     rule: StopRule
     contexts: TensorDict
+    branch_points: BranchPoints | None = None
 
     @classmethod
     def load(cls, run: Run, suffix: str) -> Imagination:
         """That of a round."""
         world_model = run.world_model(suffix)
-        contexts = read_contexts(run, world_model.cameras, rounds=int(suffix.removeprefix("_") or 1))
+        settings = run.config.post_train
+        _, explored = demonstrations_and_exploration(run, rounds=int(suffix.removeprefix("_") or 1))
+        contexts, points = contexts_of(explored, world_model.cameras), None
+        if settings.branch_share:
+            points = BranchPoints(
+                explored.through(world_model.cameras),
+                run.config.chunk_length,
+                share=settings.branch_share,
+                latest=settings.branch_until,
+            )
         rule = run.rules(suffix)["imagined"]
-        return cls(world_model, run.reflector(suffix).for_world("imagined"), rule, to_device(contexts, run.device))
+        judge = run.reflector(suffix).for_world("imagined")
+        return cls(world_model, judge, rule, to_device(contexts, run.device), points)
 
     def env(
         self,
@@ -49,14 +61,15 @@ class Imagination:
         *,
         seed: int,
         sampler: ContextSampler | None = None,
+        branches: bool = False,
     ) -> TransformedEnv:
         """FK, action map, world model; the reflector gives the reward and stops; frames are not carried along."""
         groups, group_size = batch_size
-        make = self.makes(run, group_size, contexts, seed=seed)
+        make = self.makes(run, group_size, contexts, seed=seed, branches=branches)
         return make(groups, sampler=sampler, transforms=[FramesAside(run.folder.scratch)])
 
     def makes(
-        self, run: Run, group_size: int, contexts: TensorDict | None = None, *, seed: int
+        self, run: Run, group_size: int, contexts: TensorDict | None = None, *, seed: int, branches: bool = False
     ) -> Callable[..., TransformedEnv]:
         """``makes(...)(groups)`` is the same env for so many groups; frames are carried along."""
         return partial(
@@ -67,6 +80,7 @@ class Imagination:
             max_steps=run.config.max_steps,
             proprio=PROPRIO,
             seed=seed,
+            branch_points=self.branch_points if branches else None,
         )
 
 
@@ -97,9 +111,8 @@ def frames_aside(env: EnvBase) -> FramesAside | None:
     return next((each for each in getattr(transform, "transforms", ()) if isinstance(each, FramesAside)), None)
 
 
-def read_contexts(run: Run, cameras: Sequence[str], rounds: int = 1) -> TensorDict:
-    """The distinct training contexts (g, o_1, s_1) of the exploration of some rounds; no simulator is touched."""
-    _, explored = demonstrations_and_exploration(run, rounds)
+def contexts_of(explored: Episodes, cameras: Sequence[str]) -> TensorDict:
+    """The distinct contexts (g, o_1, s_1) that ``explored`` episodes begin with; no simulator is touched."""
     ids = explored[keys.CONTEXT_ID].squeeze(-1)
     rows = torch.tensor([int((ids == value).nonzero()[0, 0]) for value in ids.unique()])
     first = torch.zeros_like(rows)

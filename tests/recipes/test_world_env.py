@@ -12,7 +12,8 @@ import torch
 import world_env
 from checks import check_config
 from config import GOAL_TASKS, PRESETS, SFT, Demonstrate, Evaluate, Explore, PostTrain, Reflector, WorldModel
-from imagination import read_contexts
+from episodes import demonstrations_and_exploration
+from imagination import contexts_of
 from parts import COMPACT, Part
 from run import Run
 from run_folder import RunFolder
@@ -107,7 +108,8 @@ def test_the_whole_loop_runs_writes_its_files_and_continues_where_it_stopped(tin
         "post_train",
     }
     assert all((tiny.run_dir / "plots" / f"{name}.png").exists() for name in ("losses", "evaluation"))
-    contexts = read_contexts(Run(tiny, folder), tiny.cameras)[keys.CONTEXT_ID].flatten().tolist()
+    _, explored = demonstrations_and_exploration(Run(tiny, folder), 1)
+    contexts = contexts_of(explored, tiny.cameras)[keys.CONTEXT_ID].flatten().tolist()
     assert contexts == [context_id(0, "train", index) for index in range(4)]  # exploration visits every one
     wave = read_rollouts(folder.rollouts("post_train_000"))
     steps = wave["next", keys.STEP_MASK]

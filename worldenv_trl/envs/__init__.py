@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from worldenv_trl.context_ids import context_id
+    from worldenv_trl.envs.branch_points import BranchPoints
     from worldenv_trl.envs.chunking import ChunkedActions, chunked
     from worldenv_trl.envs.context_sampler import ContextSampler
     from worldenv_trl.envs.expert import ExpertPolicy
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from worldenv_trl.envs.tabletop import TabletopEnv
 
 __all__ = [
+    "BranchPoints",
     "ChunkedActions",
     "ContextSampler",
     "ExpertPolicy",
@@ -33,6 +35,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "BranchPoints": "worldenv_trl.envs.branch_points",
     "ChunkedActions": "worldenv_trl.envs.chunking",
     "ContextSampler": "worldenv_trl.envs.context_sampler",
     "ExpertPolicy": "worldenv_trl.envs.expert",

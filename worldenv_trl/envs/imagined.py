@@ -10,10 +10,11 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from worldenv_trl.devices import to_device
+from worldenv_trl.envs.branch_points import BranchPoints
 from worldenv_trl.envs.context_sampler import ContextSampler
 from worldenv_trl.envs.contexts import ContextOrder, check_contexts, context_keys
 from worldenv_trl.envs.imagined_specs import imagined_specs
-from worldenv_trl.envs.starts import GivenStarts
+from worldenv_trl.envs.imagined_starts import ImaginedStarts
 from worldenv_trl.keys import (
     ACTION_DIM,
     CHUNK,
@@ -37,14 +38,15 @@ from worldenv_trl.keys import (
 )
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.language import instructions_of
-from worldenv_trl.row_share import own_items
 from worldenv_trl.world_models import WorldModel, request
 from worldenv_trl.world_models.noise_seeds import noise_seeds
 
 __all__ = ["ImaginedEnv"]
 
+_DECISIONS = 10_000  # of a rollout, at most
 
-class ImaginedEnv(GivenStarts, EnvBase):
+
+class ImaginedEnv(ImaginedStarts, EnvBase):
     """Rollouts in a video world model (World-Env section 3.2): one decision, a chunk of actions, is one step.
 
     Forward kinematics predicts the hand's states over the chunk, the world model paints the frames. Reward is 0 and
@@ -70,6 +72,9 @@ class ImaginedEnv(GivenStarts, EnvBase):
         seed: of the contexts' order and of the noise; drawn from torch's generator when None.
         device: of the specs and buffers; the contexts' when None. World model and kinematics must be there, too.
         context_sampler: draws the contexts of each task by how mixed their groups were, instead of in shuffled passes.
+        branch_points: where some of the groups begin instead of at a context of their task: in the middle of an
+            episode, whose real frames are then what the world model remembers. Such a rollout cannot be replayed from
+            its recording alone, nor relived from its ``context_id``: set their ``share`` to 0 for waves that are kept.
 
     A reset of a whole group draws its next context, the tasks in turn and without replacement while that is possible;
     rows reset while others of their group are running restart their context, so that a group never mixes contexts.
@@ -103,6 +108,7 @@ class ImaginedEnv(GivenStarts, EnvBase):
         seed: int | None = None,
         device: torch.device | str | None = None,
         context_sampler: ContextSampler | None = None,
+        branch_points: BranchPoints | None = None,
     ) -> None:
         batch = torch.Size(batch_size)
         if len(batch) != 2 or min(batch) < 1:
@@ -122,6 +128,15 @@ class ImaginedEnv(GivenStarts, EnvBase):
         self._contexts = contexts.select(*context_keys(self.cameras)).to(device).contiguous()
         self._instructions = instructions_of(contexts)
         self.context_sampler, self._order = context_sampler, ContextOrder(contexts, context_sampler)
+        self.branch_points = branch_points
+        if branch_points is not None:
+            branch_points.episodes.require("the world model", world_model.cameras, world_model.image_size)
+            if branch_points.chunk_length != self.chunk_length or branch_points.latest >= self.max_steps:
+                raise ValueError(
+                    f"branch points are at every {branch_points.chunk_length} steps up to {branch_points.latest}, "
+                    f"rollouts have chunks of {self.chunk_length} and end at {self.max_steps}: branch at whole chunks, "
+                    "before the end"
+                )
         specs = imagined_specs(batch, self.cameras, self.image_size, self.chunk_length, self._instructions[0], device)
         self.observation_spec, self.state_spec, self.action_spec, self.reward_spec, self.done_spec = specs
         self._make_buffers()
@@ -148,8 +163,10 @@ class ImaginedEnv(GivenStarts, EnvBase):
         buffer("_context", 1, dtype=torch.int64)
         buffer("_steps", dtype=torch.int64)
         buffer("_decisions", dtype=torch.int64)
+        buffer("_point", dtype=torch.int64)
         buffer("_episode", dtype=torch.int64)  # which noise; 0 for contexts given by the caller
         buffer("_resets", dtype=torch.int64)
+        self._point.fill_(-1)
         self._text = [self._instructions[0]] * rows
         self._text_stack: NonTensorStack | None = None
         self._begun = [False] * self.batch_size[0]  # groups that have a context
@@ -164,43 +181,7 @@ class ImaginedEnv(GivenStarts, EnvBase):
         slot[numbers] = torch.arange(len(numbers))
         return len(numbers), slot.to(self.device)
 
-    def _kept(self, camera: str) -> Tensor:
-        """The frames that may be asked for: uint8 [G * N, K, 3, H, W]."""
-        return self.get_buffer(f"_memory_{camera}")
-
-    def _image(self, camera: str) -> Tensor:
-        """What is seen now: uint8 [G * N, 3, H, W]."""
-        return self.get_buffer(f"_image_{camera}")
-
-    def _set_seed(self, seed: int | None) -> None:
-        self._seed = int(torch.randint(2**31, ()).item()) if seed is None else int(seed)
-        self._order.seed(self._seed)
-        self._resets.zero_()
-
     # ------------------------------------------------------------------------------------------------- reset
-
-    def order_state(self) -> dict[str, Any]:
-        """What decides which contexts and which noise the next reset of all rows begins with; take it between waves."""
-        return {"seed": self._seed, "order": self._order.state_dict(), "resets": self._resets.clone()}
-
-    def load_order_state(self, state: dict[str, Any]) -> None:
-        """Lets the next reset of all rows begin as it would have where :meth:`order_state` gave ``state``."""
-        self._seed = state["seed"]
-        self._order.load_state_dict(state["order"])
-        self._resets.copy_(state["resets"])
-
-    def draw_starts(self) -> TensorDict:
-        """Draws what the next reset of all rows would begin with, and counts as that reset; nothing is loaded.
-
-        Returns:
-            TensorDict ``[G, N]``: ``place`` int64 in the contexts [K], and ``episode`` int64, by which the noise of a
-            row's rollouts differs. For :meth:`begin_with`.
-        """
-        groups, rollouts = self.batch_size
-        self._resets += 1
-        place = torch.tensor(own_items(self._order.draw, groups), dtype=torch.int64).repeat_interleave(rollouts)
-        starts = {"place": place.view(groups, rollouts), "episode": self._resets.cpu().view(groups, rollouts).clone()}
-        return TensorDict(starts, self.batch_size)
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
         groups, rollouts = self.batch_size
@@ -219,61 +200,20 @@ class ImaginedEnv(GivenStarts, EnvBase):
         else:
             starts = self.draw_starts() if starts is None else starts
             self._resets.copy_(starts["episode"].flatten())
-        self._steps[rows] = 0
-        self._decisions[rows] = 0
         if set_state:
+            self._point[rows] = -1
             self._load(rows, *self._given(tensordict, rows))
             self._episode[rows] = 0
         else:
-            if starts is None:
-                drawn = own_items(self._order.draw, len(whole))
-                index = torch.tensor(drawn, dtype=torch.int64).repeat_interleave(rollouts)
-            else:
-                index = starts["place"].flatten()
+            place = self._draw(len(whole)) if starts is None else starts["place"].flatten()
             fresh = torch.tensor(whole, dtype=torch.int64)[:, None] * rollouts + torch.arange(rollouts)
-            text = [self._instructions[i] for i in index.tolist()]
-            self._load(fresh.flatten().to(self.device), self._contexts[index.to(self._contexts.device)], text)
-            self._kinematic[rows, 1], self._state[rows, 1] = self._kinematic[rows, 0], self._state[rows, 0]
-            for camera in self.cameras:
-                self._image(camera)[rows] = self._kept(camera)[rows, 0]
+            self._load_places(fresh.flatten().to(self.device), place)
             self._episode[rows] = self._resets[rows]
+        self._rewind(rows)
         self._begun = [True] * groups
         out = self._observe()
         out.update(self.full_done_spec.zero())
         return out
-
-    def _load(self, rows: Tensor, start: TensorDictBase, text: list[str]) -> None:
-        """Put the contexts ``start`` [n] into ``rows`` [n]."""
-        start = start.to(self.device)
-        for camera in self.cameras:
-            self._kept(camera)[rows, 0] = self._image(camera)[rows] = start[image_key(camera)]
-        self._state[rows] = start[STATE].unsqueeze(1)
-        self._kinematic[rows] = start[KINEMATIC_STATE].unsqueeze(1)
-        self._poses[rows, 0] = self.kinematics.pose(start[KINEMATIC_STATE])
-        self._task[rows], self._context[rows] = start[TASK_ID], start[CONTEXT_ID]
-        for row, words in zip(rows.tolist(), text, strict=True):
-            self._text[row] = words
-        self._text_stack = None
-
-    def _given(self, tensordict: TensorDictBase | None, rows: Tensor) -> tuple[TensorDictBase, list[str]]:
-        """The contexts of ``rows`` that the caller put into the reset's tensordict."""
-        keys = set() if tensordict is None else set(tensordict.keys(True, True))
-        needed = context_keys(self.cameras)
-        missing = [key for key in needed if key not in keys]
-        if tensordict is None or missing:
-            raise ValueError(f"reset(set_state=True) needs {needed} in its tensordict; missing: {missing}")
-        start = tensordict.select(*needed).to(self.device).flatten(0, 1)[rows]
-        size = (3, self.image_size, self.image_size)
-        for camera in self.cameras:
-            if tuple(start[image_key(camera)].shape[1:]) != size:
-                raise ValueError(
-                    f"the contexts' {image_key(camera)} is {tuple(start[image_key(camera)].shape[1:])}, not {size}"
-                )
-        if INSTRUCTION in tensordict.keys():  # noqa: SIM118 - a TensorDict iterates over rows
-            text = instructions_of(tensordict)
-            return start, [text[row] for row in rows.tolist()]
-        by_task = dict(zip(self._contexts[TASK_ID].flatten().tolist(), self._instructions, strict=True))
-        return start, [by_task.get(task, "") for task in start[TASK_ID].flatten().tolist()]
 
     # ------------------------------------------------------------------------------------------------- step
 
@@ -368,7 +308,8 @@ class ImaginedEnv(GivenStarts, EnvBase):
         return chunk.detach().to(self.device, torch.float32).flatten(0, 1)
 
     def _noise_seeds(self, rows: Tensor) -> Tensor:
-        parts = (self._context[rows, 0], rows % self.batch_size[1], self._episode[rows], self._decisions[rows])
+        place = self._decisions[rows] + _DECISIONS * (self._point[rows] + 1)
+        parts = (self._context[rows, 0], rows % self.batch_size[1], self._episode[rows], place)
         return noise_seeds(self._seed, *parts).unsqueeze(-1)
 
     def _observe(self, *, frames: bool = True) -> TensorDictBase:

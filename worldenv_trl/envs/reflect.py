@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -33,7 +34,8 @@ __all__ = ["Reflect"]
 class Reflect(Transform):
     """Scores every prefix of a rollout's video and ends the rollout at once when its rule says that the task is done.
 
-    Over :class:`ImaginedEnv` all frames of a chunk are scored in one batch; the rule ends the row *inside* the chunk:
+    Over :class:`ImaginedEnv` all frames of a chunk are scored in one batch, and rollouts that begin in the middle of a
+    recorded episode are judged as its continuation; the rule ends the row *inside* the chunk:
     ``step_mask`` is False behind it, and images, states and ``num_steps`` are those of the frame that ended it. Over a
     step-level :class:`TabletopEnv` each frame is scored as it comes (put :func:`chunked` around it, not inside). Frames
     go to the reflector's device, scores come back to the env's.
@@ -112,12 +114,33 @@ class Reflect(Transform):
             goals = instructions_of(tensordict_reset)
             goals = [goals[row] for row in rows.tolist()]
             there = device_of(self.reflector, device)
-            state = self.reflector.begin({camera: shown[rows].to(there) for camera, shown in images.items()}, goals)
+            state = self.reflector.begin({name: shown[rows].to(there) for name, shown in images.items()}, goals)
             self._check("begin", "state['score']", tuple(state["score"].shape), (len(rows),))
+            state = self._seen_before(rows, state, goals, there)
             memory["state"] = _merged(memory["state"], rows, state, count)
             memory["prob"][rows], memory["streak"][rows] = state["score"].float().to(device), 0
         tensordict_reset[SUCCESS_PROB] = memory["prob"].reshape(*batch, 1).clone()
         return tensordict_reset
+
+    def _seen_before(
+        self, rows: Tensor, state: TensorDictBase, goals: Sequence[str], device: torch.device
+    ) -> TensorDictBase:
+        """The state of ``rows`` [n] where some of their rollouts go on from the middle of an episode, which is theirs,
+        too; no rule looks at it."""
+        past = getattr(self.parent, "past", None)
+        for some, video in () if past is None else past(rows):
+            shown = {camera: video[frames_key(camera)] for camera in self.reflector.cameras}
+            if self.reflector.reads_path:
+                shown[KINEMATIC_STATES] = video[KINEMATIC_STATES]
+            shown = {name: values.to(device) for name, values in shown.items()}
+            begun = self.reflector.begin(
+                {name: values[:, 0] for name, values in shown.items()}, [goals[i] for i in some]
+            )
+            read = [*(self.reflector.cameras if self.reflector.reads_video else ()), KINEMATIC_STATES]
+            later = {name: values[:, 1:] for name, values in shown.items() if name in read}
+            lived, _ = self.reflector.extend(begun, later)
+            state = _merged(state, some.to(device), lived, len(rows))
+        return state
 
     # ------------------------------------------------------------------------------------------------- step
 
