@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import NonTensorStack, TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from worldenv_trl.envs.branch_points import BranchPoints
 from worldenv_trl.envs.contexts import ContextOrder, context_keys
@@ -205,8 +205,8 @@ class ImaginedStarts(GivenStarts):
 
     def _kept(self, camera: str) -> Tensor:
         """The frames that may be asked for: uint8 [G * N, K, 3, H, W]."""
-        return self.get_buffer(f"_memory_{camera}")
+        return cast(nn.Module, self).get_buffer(f"_memory_{camera}")
 
     def _image(self, camera: str) -> Tensor:
         """What is seen now: uint8 [G * N, 3, H, W]."""
-        return self.get_buffer(f"_image_{camera}")
+        return cast(nn.Module, self).get_buffer(f"_image_{camera}")
