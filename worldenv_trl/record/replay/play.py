@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from worldenv_trl.devices import device_of
-from worldenv_trl.keys import FRAMES, MASK, SUCCESS, SUCCESS_PROB
+from worldenv_trl.keys import FRAMES, MASK, NUM_STEPS, SUCCESS, SUCCESS_PROB
 from worldenv_trl.record.mcap.provenance import model_hash, package_versions
 from worldenv_trl.record.mcap.reader import list_rollouts, read_attachments, read_rollouts
 from worldenv_trl.record.mcap.recording import Recording
@@ -205,6 +205,12 @@ def _imagined(
     world_model = options["world_model"]
     length = world_model.chunk_length
     rollouts = chunks_of(source, length, world_model.cameras)
+    begun = rollouts[0, 0].get(NUM_STEPS, None)
+    if source.imagined and begun is not None and int(begun):
+        raise ValueError(
+            f"rollout {source.number} of {source.path} branched from step {int(begun)} of a recorded episode, whose "
+            "frames it does not hold: it cannot be imagined again. Record waves whose branch_points have share 0"
+        )
     known = source.env.get("max_steps", source.steps) if source.imagined else source.steps
     options["max_steps"] = max(known) if isinstance(known, list) else max(int(known), source.steps)
     options["proprio"] = source.env.get("proprio", "commanded")
