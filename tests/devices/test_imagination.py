@@ -20,7 +20,7 @@ from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.data import episodes_from_rollouts, imagine_episodes, score_episodes, window_buffer
 from worldenv_trl.devices import to_device
-from worldenv_trl.envs import FramesAside, ImaginedEnv, Reflect
+from worldenv_trl.envs import BranchPoints, FramesAside, ImaginedEnv, Reflect
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.objectives import LOOPLoss, WorldModelLoss, rloo_advantage
 from worldenv_trl.policies import DeviceBridge, laplace_actor, scale_bounds
@@ -38,12 +38,29 @@ def parts(**settings) -> tuple:
     return model, reflector, policy
 
 
-def wave_of(device: torch.device, seed: int = 0, **settings) -> tuple:
+def lived() -> TensorDict:
+    """Rollouts [2, 16] that stand still and succeed in the end."""
+    rollouts = TensorDict(batch_size=[2, 16])
+    contexts = make_contexts(2, ("agentview",), 32)
+    for key in (("observation", "image"), keys.STATE, keys.KINEMATIC_STATE, keys.TASK_ID, keys.CONTEXT_ID):
+        rollouts[key] = contexts[key].unsqueeze(1).expand(2, 16, *contexts[key].shape[1:]).contiguous()
+    rollouts["next"] = rollouts.clone()
+    rollouts["next", "done"] = torch.arange(16).eq(15).view(1, 16, 1).expand(2, 16, 1).clone()
+    rollouts["next", keys.SUCCESS] = rollouts["next", "done"].clone()
+    rollouts[keys.ACTION] = torch.rand(2, 16, 7, generator=torch.Generator().manual_seed(0)) - 0.5
+    rollouts[keys.INSTRUCTION] = "pull"
+    return rollouts
+
+
+def wave_of(device: torch.device, seed: int = 0, branched: bool = False, **settings) -> tuple:
     """A wave [2, 3] of greedy imagined rollouts, and what was there."""
     model, reflector, policy = (part.to(device) for part in parts(**settings))
     contexts = to_device(make_contexts(cameras=("agentview",), size=32), device)
     kinematics = ForwardKinematics().to(device)
-    env = ImaginedEnv(model, kinematics, contexts, [2, 3], max_steps=20, seed=seed)
+    points = None
+    if branched:
+        points = BranchPoints(episodes_from_rollouts(lived()), model.chunk_length, share=1.0, latest=model.chunk_length)
+    env = ImaginedEnv(model, kinematics, contexts, [2, 3], max_steps=20, seed=seed, branch_points=points)
     aside = FramesAside()
     aside.keep = True
     rule = StopRule(0.999)
@@ -53,8 +70,10 @@ def wave_of(device: torch.device, seed: int = 0, **settings) -> tuple:
     return next(iter(collector)), aside, policy, actor, model
 
 
-def test_a_wave_is_the_same_there_and_stays_there(gpu):
-    (here, frames, *_), (there, others, *_) = wave_of(torch.device("cpu")), wave_of(gpu)
+@pytest.mark.parametrize("branched", [False, True], ids=["from contexts", "from the middle of an episode"])
+def test_a_wave_is_the_same_there_and_stays_there(gpu, branched):
+    (here, frames, *_), (there, others, *_) = (wave_of(each, branched=branched) for each in (torch.device("cpu"), gpu))
+    assert bool(here[keys.NUM_STEPS][:, 0, 0].any()) == branched
     for key in here.keys(True, True):
         if isinstance(here[key], torch.Tensor):
             assert there[key].device.type == "cuda", key
@@ -93,15 +112,7 @@ def test_loop_updates_on_what_it_imagined_there(gpu, tmp_path):
 
 
 def test_episodes_stay_on_the_cpu_and_are_imagined_and_scored_there(gpu):
-    rollouts = TensorDict(batch_size=[2, 16])
-    contexts = make_contexts(2, ("agentview",), 32)
-    for key in (("observation", "image"), keys.STATE, keys.KINEMATIC_STATE, keys.TASK_ID, keys.CONTEXT_ID):
-        rollouts[key] = contexts[key].unsqueeze(1).expand(2, 16, *contexts[key].shape[1:]).contiguous()
-    rollouts["next"] = rollouts.clone()
-    rollouts["next", "done"] = torch.arange(16).eq(15).view(1, 16, 1).expand(2, 16, 1).clone()
-    rollouts["next", keys.SUCCESS] = rollouts["next", "done"].clone()
-    rollouts[keys.ACTION] = torch.rand(2, 16, 7, generator=torch.Generator().manual_seed(0)) - 0.5
-    rollouts[keys.INSTRUCTION] = "pull"
+    rollouts = lived()
     model, reflector, _ = parts()
     made = []
     for device in (torch.device("cpu"), gpu):
