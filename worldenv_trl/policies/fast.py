@@ -8,7 +8,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -121,7 +121,7 @@ class FASTPolicy(LanguageTokenPolicy):
     """
 
     config_class = FASTConfig
-    companion_names = (TOKENIZER_NAME, VOCABULARY_NAME, CODEC_NAME)
+    companion_names: ClassVar[tuple[str, ...]] = (TOKENIZER_NAME, VOCABULARY_NAME, CODEC_NAME)
     sequential = True
     resize = "bilinear"
     config: FASTConfig

@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -122,7 +122,7 @@ class VisionLanguagePolicy(Policy, Pretrained):
         tokenizer: of the backbone; saved beside the weights as ``tokenizer.json``.
     """
 
-    companion_names = (TOKENIZER_NAME,)
+    companion_names: ClassVar[tuple[str, ...]] = (TOKENIZER_NAME,)
     resize = "lanczos"
     config: VisionLanguageConfig
     backbone: Any
