@@ -34,8 +34,14 @@ def check_shares(config: WorldEnvConfig, processes: int) -> None:
 
 
 def check_ratio_level(config: WorldEnvConfig, policy: Policy) -> None:
-    """Raises ``ValueError`` for a ratio of each token where the policy has none."""
-    if config.post_train.ratio_level == "token" and not isinstance(policy, TokenPolicy):
+    """Raises ``ValueError`` for a ratio that the policy does not have."""
+    level = config.post_train.ratio_level
+    if isinstance(policy, TokenPolicy) and policy.sequential and level == "step":
+        raise ValueError(
+            f"post_train.ratio_level must be chunk or token for {type(policy).__name__}, whose tokens belong to whole "
+            "chunks, got 'step'"
+        )
+    if level == "token" and not isinstance(policy, TokenPolicy):
         raise ValueError(
             f"post_train.ratio_level must be step or chunk for {type(policy).__name__}, which does not act by tokens, "
             "got 'token'"

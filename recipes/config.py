@@ -141,7 +141,7 @@ class PostTrain:
     clip_epsilon: float = 0.1
     ratio_level: str = "step"
     """``step`` (World-Env Eq. 5), ``chunk``: one ratio for all steps of a chunk, or ``token``: one for each token of a
-    policy that acts by tokens."""
+    policy that acts by tokens. FAST's belong to whole chunks: ``chunk`` or ``token``."""
     lora_rank: int = 16
     """Of the adapters; at 0 the whole policy is updated instead, but for frozen encoders."""
     lora_lr: float = 2e-4
@@ -180,12 +180,16 @@ class RealSize:
 
     policy: Path | None = None
     """A vision-language model as transformers' ``save_pretrained`` wrote it, a checkpoint of OpenVLA or OpenVLA-OFT, or
-    LeRobot's of SmolVLA, pi0 or pi0.5."""
+    LeRobot's of SmolVLA, pi0, pi0.5 or pi0-FAST."""
     statistics: str = ""
     """Key of the checkpoint's ``dataset_statistics.json``; the only one when empty."""
     action_head: str = "continuous"
-    """Of the policy: ``continuous`` (OpenVLA-OFT's heads, a Laplace density) or ``tokens`` (OpenVLA's, the vocabulary's
-    last tokens one after the other)."""
+    """Of the policy: ``continuous`` (OpenVLA-OFT's heads, a Laplace density), ``tokens`` (OpenVLA's, the vocabulary's
+    last tokens one after the other) or ``fast`` (pi0-FAST's, tokens of whole chunks). LeRobot's policies have their
+    own: leave it out."""
+    action_tokenizer: str = ""
+    """Folder or Hub id of FAST's tokenizer; when empty that of LeRobot's policy, and for ``fast`` on a vision-language
+    model one is trained on the run's demonstrations."""
     backbone: str = ""
     """Folder or Hub id of which LeRobot's policy has its tokenizer, and SmolVLA its backbone's config; when empty its
     own folder, and what its config names."""

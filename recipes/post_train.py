@@ -63,6 +63,7 @@ def post_train(
     waves = Waves(run, target, models, actor, sampler)
     imagination = waves.imagination
     read = [*policy.in_keys, *([keys.TOKENS] if isinstance(policy, TokenPolicy) else [])]
+    read += [key for key in (keys.TOKEN_IS_PAD,) if key in actor.out_keys]
 
     def make_loss(part: Policy) -> LOOPLoss:
         scored = actor if part is policy else exploring_actor(config, part, settings.scale_factor)

@@ -9,10 +9,11 @@ from typing import Any
 
 import torch
 from tokenizers import Tokenizer, models, pre_tokenizers, processors
-from transformers import AutoModelForImageTextToText, LlavaOnevisionConfig
+from transformers import AutoModelForImageTextToText, LlavaOnevisionConfig, PaliGemmaConfig
 
 from config import WorldEnvConfig
-from real_parts import by_tokens, outlined_world_model, policy_settings, reflector_config
+from real_parts import action_head, outlined_world_model, policy_settings, reflector_config
+from worldenv_trl.policies.fast import FASTConfig, FASTPolicy
 from worldenv_trl.policies.hf import HFConfig, HFPolicy
 from worldenv_trl.policies.hf_tokens import HFTokenConfig, HFTokenPolicy
 from worldenv_trl.policies.prismatic import PrismaticConfig, dinosiglip_towers
@@ -37,10 +38,44 @@ def openvla_oft_7b() -> PrismaticConfig:
     return PrismaticConfig(LLAMA_2_7B, {"image_size": 224, "towers": towers})
 
 
+def siglip_so400m(image_size: int) -> dict:
+    return {
+        "model_type": "siglip_vision_model",
+        "hidden_size": 1152,
+        "intermediate_size": 4304,
+        "num_hidden_layers": 27,
+        "num_attention_heads": 16,
+        "image_size": image_size,
+        "patch_size": 14,
+        "vision_use_head": False,
+    }
+
+
+def paligemma_3b() -> PaliGemmaConfig:
+    """google/paligemma-3b-pt-224's sizes."""
+    text = {
+        "model_type": "gemma",
+        "hidden_size": 2048,
+        "intermediate_size": 16384,
+        "num_hidden_layers": 18,
+        "num_attention_heads": 8,
+        "num_key_value_heads": 1,
+        "head_dim": 256,
+        "vocab_size": 257216,
+    }
+    return PaliGemmaConfig(
+        text_config=text, vision_config=siglip_so400m(224), image_token_index=257152, projection_dim=2048
+    )
+
+
 def words(action_tokens: Sequence[int] = ()) -> Tokenizer:
     """One token a word: prompts come out about as long as with a real tokenizer; and tokens of these ids."""
     special = ["<s>", "<fake_token_around_image>", "<global-img>"]
-    known = [*special, *HFConfig.prompt.format(instruction=INSTRUCTION).replace(":", " : ").replace("?", " ? ").split()]
+    known = [
+        *special,
+        FASTConfig.end,
+        *HFConfig.prompt.format(instruction=INSTRUCTION).replace(":", " : ").replace("?", " ? ").split(),
+    ]
     numbers = {word: number for number, word in enumerate(dict.fromkeys(["<unk>", *known]))}
     numbers |= {f"<{number}>": number for number in action_tokens}
     tokenizer = Tokenizer(models.WordLevel(numbers, unk_token="<unk>"))
@@ -75,11 +110,15 @@ class WordTokens:
         return SimpleNamespace(input_ids=[self._video_token if "<video>" in word else place for place, word in words])
 
 
-def outlined_policy(config: WorldEnvConfig) -> HFPolicy | HFTokenPolicy:
-    """OpenVLA-OFT-7B on the meta device, or OpenVLA-7B, which acts by tokens."""
+def outlined_policy(config: WorldEnvConfig) -> HFPolicy | HFTokenPolicy | FASTPolicy:
+    """OpenVLA-OFT-7B on the meta device, or OpenVLA-7B or pi0-FAST-3B, which act by tokens."""
     settings = policy_settings(config) | {"chunk_length": 8, "proprio_format": "libero", "readout_shift": 1}
     with torch.device("meta"):
-        if by_tokens(config):
+        if action_head(config) == "fast":
+            tokens = policy_settings(config) | {"chunk_length": config.chunk_length, "action_token_end": 257152}
+            sizes = {"backbone": paligemma_3b().to_dict(), "fast_vocab_size": 2048}
+            return FASTPolicy(FASTConfig(**sizes, **tokens), words())
+        if action_head(config) == "tokens":
             tokens = policy_settings(config) | {"chunk_length": config.chunk_length, "action_token_end": 32000}
             backbone = openvla_oft_7b().to_dict()
             return HFTokenPolicy(HFTokenConfig(backbone=backbone, **tokens), words(range(31744, 32000)))

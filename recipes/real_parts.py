@@ -12,6 +12,7 @@ from config import WorldEnvConfig
 from libero_files import from_libero
 from parts import COMPACT, PROPRIO, Part, Parts, cameras_of, instructions
 from worldenv_trl.policies import (
+    FASTPolicy,
     FlowPolicy,
     HFPolicy,
     HFTokenPolicy,
@@ -21,12 +22,13 @@ from worldenv_trl.policies import (
     load_openvla_oft,
 )
 from worldenv_trl.policies.hf_files import check_weights, read_json
+from worldenv_trl.policies.lerobot_fast import PI0_FAST
 from worldenv_trl.reflectors import Reflector, VLMReflector, VLMReflectorConfig
 from worldenv_trl.reflectors.video_language_model import VideoLanguageModel
 from worldenv_trl.world_models import DiffusionWorldModel, DiffusionWorldModelConfig, WorldModel, load_diffusers
 
 NAMES = ("compact", "real-size")
-ACTION_HEADS = ("continuous", "tokens")
+ACTION_HEADS = ("continuous", "tokens", "fast")
 
 
 def parts_of(config: WorldEnvConfig) -> Parts:
@@ -52,15 +54,25 @@ def make_policy(config: WorldEnvConfig, device: str = "cpu") -> Policy:
     settings = policy_settings(config)
     described = read_json(folder, "config.json")
     if "input_features" in described:
-        if by_tokens(config):
+        chosen, whole = config.real_size, described.get("type") == PI0_FAST
+        if action_head(config) not in ("continuous", "fast" if whole else "continuous"):
             raise ValueError(
-                f"{folder} holds LeRobot's policy, which does not act by tokens: --real-size.action-head continuous"
+                f"{folder} holds LeRobot's policy, which does not act by such tokens: --real-size.action-head "
+                + ("fast" if whole else "continuous")
             )
-        chosen = config.real_size
         settings |= {"backbone": chosen.backbone or None, "mirror": chosen.mirror, "chunk_length": config.chunk_length}
+        if whole:
+            settings["action_tokenizer"] = chosen.action_tokenizer or None
         return load_lerobot(folder, device=device, **settings)
     openvla = described.get("model_type") == "openvla"
-    if by_tokens(config):
+    if action_head(config) == "fast":
+        if openvla:
+            raise ValueError(
+                f"{folder} holds OpenVLA's policy, which does not act by FAST's tokens: another action-head"
+            )
+        settings |= {"chunk_length": config.chunk_length, "action_tokenizer": config.real_size.action_tokenizer or None}
+        return FASTPolicy.from_backbone(folder, device=device, **settings)
+    if action_head(config) == "tokens":
         settings["chunk_length"] = config.chunk_length
         if not openvla:
             return HFTokenPolicy.from_backbone(folder, device=device, **settings)
@@ -87,13 +99,14 @@ def make_policy(config: WorldEnvConfig, device: str = "cpu") -> Policy:
 def load_policy(folder: Path) -> Policy:
     """What ``save_pretrained`` of a policy of :func:`make_policy` wrote."""
     written = read_json(folder, "config.json").get("class")
-    kinds: tuple[type[HFTokenPolicy] | type[FlowPolicy], ...] = (HFTokenPolicy, FlowPolicy)
+    kinds: tuple[type[HFTokenPolicy] | type[FASTPolicy] | type[FlowPolicy], ...]
+    kinds = (HFTokenPolicy, FASTPolicy, FlowPolicy)
     kind = next((kind for kind in kinds if kind.__name__ == written), HFPolicy)
     return kind.from_pretrained(folder)
 
 
-def by_tokens(config: WorldEnvConfig) -> bool:
-    """Whether the policy is to act by tokens.
+def action_head(config: WorldEnvConfig) -> str:
+    """How the policy is to act.
 
     Raises:
         ValueError: for a head that is not known.
@@ -101,7 +114,7 @@ def by_tokens(config: WorldEnvConfig) -> bool:
     head = config.real_size.action_head
     if head not in ACTION_HEADS:
         raise ValueError(f"real_size.action_head must be one of {', '.join(ACTION_HEADS)}, got {head!r}")
-    return head == "tokens"
+    return head
 
 
 def policy_settings(config: WorldEnvConfig) -> dict[str, Any]:

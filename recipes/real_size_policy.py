@@ -6,9 +6,9 @@ from functools import partial
 
 import torch
 from torch import Tensor, nn
-from transformers import LlavaConfig, PaliGemmaConfig, PretrainedConfig, SmolVLMConfig
+from transformers import LlavaConfig, PretrainedConfig, SmolVLMConfig
 
-from published_sizes import INSTRUCTION, LLAMA_2_7B, openvla_oft_7b, words
+from published_sizes import INSTRUCTION, LLAMA_2_7B, openvla_oft_7b, paligemma_3b, siglip_so400m, words
 from real_size_row import Row
 from worldenv_trl.keys import ACTION_DIM, STATE_DIM
 from worldenv_trl.policies import HFConfig, HFPolicy, HFTokenConfig, HFTokenPolicy, Policy, token_cross_entropy
@@ -21,19 +21,6 @@ ACTION_IDS = range(31744, 32000)  # OpenVLA's action tokens
 Inputs = tuple[dict[str, Tensor], Tensor, list[str]]
 
 
-def siglip_so400m(image_size: int) -> dict:
-    return {
-        "model_type": "siglip_vision_model",
-        "hidden_size": 1152,
-        "intermediate_size": 4304,
-        "num_hidden_layers": 27,
-        "num_attention_heads": 16,
-        "image_size": image_size,
-        "patch_size": 14,
-        "vision_use_head": False,
-    }
-
-
 def llava_7b() -> LlavaConfig:
     """LLaVA's layout with the same language model, and SigLIP-so400m alone."""
     return LlavaConfig(
@@ -42,23 +29,6 @@ def llava_7b() -> LlavaConfig:
         vision_feature_layer=-2,
         vision_feature_select_strategy="full",
         image_token_index=32000,
-    )
-
-
-def paligemma_3b() -> PaliGemmaConfig:
-    """google/paligemma-3b-pt-224's sizes."""
-    text = {
-        "model_type": "gemma",
-        "hidden_size": 2048,
-        "intermediate_size": 16384,
-        "num_hidden_layers": 18,
-        "num_attention_heads": 8,
-        "num_key_value_heads": 1,
-        "head_dim": 256,
-        "vocab_size": 257216,
-    }
-    return PaliGemmaConfig(
-        text_config=text, vision_config=siglip_so400m(224), image_token_index=257152, projection_dim=2048
     )
 
 

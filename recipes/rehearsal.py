@@ -136,7 +136,7 @@ def _act(found: Rehearsal, config: WorldEnvConfig, made: dict[str, Any]) -> None
 
     def score() -> Tensor:
         if isinstance(policy, TokenPolicy):
-            tokens = torch.zeros(ROWS, policy.chunk_length, keys.ACTION_DIM, dtype=torch.int64, device=device)
+            tokens = torch.zeros(ROWS, *policy.token_shape, dtype=torch.int64, device=device)
             logits = TeacherForcing(policy)(seen.clone(False).set(keys.TOKENS, tokens))[keys.TOKENS]
             return token_cross_entropy(logits, tokens).mean()
         out = policy(seen.clone(False))

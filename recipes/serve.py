@@ -19,6 +19,7 @@ from command_line import one_line_errors
 from threads import use_threads
 from worldenv_trl.devices import choose_device
 from worldenv_trl.policies import (
+    FASTPolicy,
     FlowPolicy,
     HFPolicy,
     HFTokenPolicy,
@@ -38,8 +39,8 @@ from worldenv_trl.record import model_hash
 @dataclass(frozen=True)
 class Settings:
     checkpoint: tyro.conf.Positional[str]
-    """Folder or Hub id of an OFTPolicy, HFPolicy, HFTokenPolicy or FlowPolicy, or folder of a release of OpenVLA, of
-    OpenVLA-OFT or of LeRobot."""
+    """Folder or Hub id of an OFTPolicy, HFPolicy, HFTokenPolicy, FASTPolicy or FlowPolicy, or folder of a release of
+    OpenVLA, of OpenVLA-OFT or of LeRobot."""
     address: str = "127.0.0.1:8765"
     """``host:port``, port 0 for any free one, or ``unix:/path``. It answers whoever reaches it."""
     backbone: str = ""
@@ -76,7 +77,7 @@ def load_policy(checkpoint: str, device: torch.device, **released: Any) -> Polic
         return release(folder, device=device, mirror=True)  # it is asked with upright images
     if "input_features" in described:
         return load_lerobot(checkpoint, device=device, **released)
-    for kind in (OFTPolicy, HFPolicy, HFTokenPolicy):
+    for kind in (OFTPolicy, HFPolicy, HFTokenPolicy, FASTPolicy):
         try:
             return kind.from_pretrained(checkpoint, device=device)
         except OtherClassError:

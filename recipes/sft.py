@@ -57,14 +57,20 @@ def fine_tune(run: Run) -> None:
 
 def _clone_tokens(policy: TokenPolicy, samples: TensorDictBase, run: Run) -> None:
     settings = run.config.sft
-    tokenizer = policy.action_tokenizer
-    samples[keys.TOKENS] = tokenizer.encode(samples[keys.CHUNK].to(device_of(policy))).to(samples[keys.CHUNK].device)
+    chunks = samples[keys.CHUNK]
+    padding: NestedKey = keys.ACTION_IS_PAD
+    tokens = policy.action_tokenizer.encode(chunks.to(device_of(policy)))
+    samples[keys.TOKENS] = tokens.to(chunks.device)
+    if policy.sequential:  # whole chunks: past the end of an episode, where its last action repeats, too
+        padding = keys.TOKEN_IS_PAD
+        samples[padding] = policy.token_is_pad(tokens).to(chunks.device)
     learning = [parameter for parameter in policy.parameters() if parameter.requires_grad]
 
     def cross_entropy(part: TokenPolicy) -> BCLoss:
-        return _behaviour_cloning(TeacherForcing(part), keys.TOKENS, loss_function=token_cross_entropy)
+        actor = TeacherForcing(part)
+        return _behaviour_cloning(actor, keys.TOKENS, padding, loss_function=token_cross_entropy)
 
-    _train(policy, cross_entropy, samples, learning, settings.steps, settings.lr, run, "cross_entropy")
+    _train(policy, cross_entropy, samples, learning, settings.steps, settings.lr, run, "cross_entropy", padding)
 
 
 def _clone_chunks(policy: Policy, samples: TensorDictBase, run: Run) -> None:
@@ -89,11 +95,16 @@ def _clone_chunks(policy: Policy, samples: TensorDictBase, run: Run) -> None:
     _train(policy, nll, samples, scale, settings.scale_steps, settings.scale_lr, run, "nll")
 
 
-def _behaviour_cloning(actor: TensorDictModuleBase, action: NestedKey = keys.CHUNK, **options: Any) -> BCLoss:
+def _behaviour_cloning(
+    actor: TensorDictModuleBase,
+    action: NestedKey = keys.CHUNK,
+    padding: NestedKey = keys.ACTION_IS_PAD,
+    **options: Any,
+) -> BCLoss:
     with warnings.catch_warnings():  # about its own annotations
         warnings.simplefilter("ignore", UserWarning)
         loss = BCLoss(actor, **options)
-    loss.set_keys(action=action, pad_mask=keys.ACTION_IS_PAD)
+    loss.set_keys(action=action, pad_mask=padding)
     return loss
 
 
@@ -106,6 +117,7 @@ def _train(
     lr: float,
     run: Run,
     name: str,
+    padding: NestedKey = keys.ACTION_IS_PAD,
 ) -> None:
     settings, learner = run.config.sft, DataParallel(policy, make_loss, run.config.parallel)
     parameters, rows = learner.trained(parameters), settings.batch_size // processes.size()
@@ -124,7 +136,7 @@ def _train(
                 batch[image] = random_shift(batch[image], settings.shift_px)
         out = learner(batch)
         optimizer.zero_grad()
-        value = learner.backward_mean(out["loss_bc"], (~batch[keys.ACTION_IS_PAD]).sum())
+        value = learner.backward_mean(out["loss_bc"], (~batch[padding]).sum())
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
         schedule.step()

@@ -25,6 +25,7 @@ from worldenv_trl.policies import AutoregressiveActor, DeviceBridge, LaplaceActo
 _LEARNED_FROM = (
     keys.CHUNK,
     keys.TOKENS,
+    keys.TOKEN_IS_PAD,
     keys.LOG_PROBS,
     keys.MASK,
     keys.TASK_ID,

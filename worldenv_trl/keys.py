@@ -27,12 +27,13 @@ NUM_STEPS = "num_steps"  # int64 [*B, 1], env steps executed since the reset
 
 ACTION = "action"  # float32 [*B, 7], one env action
 CHUNK = ("vla_action", "chunk")  # float32 [*B, C, 7], unclipped Laplace sample
-TOKENS = ("vla_action", "tokens")  # int64 [*B, C, 7], of policies that act by tokens
+TOKENS = ("vla_action", "tokens")  # int64 [*B, C, 7], of policies that act by tokens; [*B, L] of a whole chunk (FAST)
+TOKEN_IS_PAD = ("vla_action", "token_is_pad")  # bool [*B, L], tokens behind the end of a sequence
 LOGITS = ("vla_action", "logits")  # float [*B, C, 7, V], over the V tokens that an action's number can be
 LOC = ("vla_action", "loc")  # float32 [*B, C, 7]
 SCALE = ("vla_action", "scale")  # float32 [*B, C, 7], exp(log-scale)
 LOG_SCALE = ("vla_action", "log_scale")  # float32 [*B, C, 7], the scale head's raw output
-LOG_PROBS = ("vla_action", "log_probs")  # float32 [*B, C], summed over the 7 dimensions; of single tokens [*B, C, 7]
+LOG_PROBS = ("vla_action", "log_probs")  # float32 [*B, C], summed over the 7 dimensions; of tokens like them
 ACTION_IS_PAD = "action_is_pad"  # bool [*B, C]
 
 FRAMES = "frames"  # ("frames", entry) uint8 [*B, C, 3, H, W] by camera, what one decision produced; see frames_key

@@ -249,7 +249,11 @@ LAYER = "model.vlm_with_expert.lm_expert.layers.1.mlp.up_proj.weight"
         (unlink("model.safetensors"), FileNotFoundError, r"holds no weights: model\*.safetensors is missing"),
         (pickled, ValueError, "holds its weights as pickles alone.*convert them once: python -c"),
         (truncate, ValueError, "model.safetensors is truncated or corrupt"),
-        (rewrite("config.json", type="act"), ValueError, "of type 'act', known are smolvla, pi0, pi05: any other runs"),
+        (
+            rewrite("config.json", type="act"),
+            ValueError,
+            "of type 'act', known are smolvla, pi0, pi05, pi0_fast: any other runs",
+        ),
         (rewrite("config.json", model_type="openvla"), ValueError, "an OpenVLA checkpoint: what reads it is load_open"),
         (rewrite("config.json", input_features=3), ValueError, "input_features must hold a type and a shape"),
         (rewrite("config.json", input_features={}), ValueError, "has no feature observation.state: there are none"),

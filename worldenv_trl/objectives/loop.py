@@ -39,6 +39,9 @@ class LOOPLoss(LossModule):
     (``normalize="global"``) or of the decision's own rollout (``"episode"``). With it, the losses of minibatches, or of
     processes, add up exactly to the loss of the whole batch; without it, the steps at hand are counted.
 
+    Of tokens that belong to a whole chunk, [*B, L] like their ``log_probs``, ``("vla_action", "token_is_pad")`` [*B, L]
+    is read, too.
+
     The step mask is an outcome of the decision: it is read below ``"next"`` where it exists there, as in every rollout
     (whose root entry belongs to the decision before), and at the root otherwise.
 
@@ -54,7 +57,9 @@ class LOOPLoss(LossModule):
             of them; ``dim``: one for each action dimension, averaged (needs log-probs [*B, C, 7], ``event_dims=0``);
             ``token``: the same for a :class:`~worldenv_trl.policies.TokenActor` or
             :class:`~worldenv_trl.policies.AutoregressiveActor`, whose tokens are the action:
-            ``set_keys(action=keys.TOKENS)``.
+            ``set_keys(action=keys.TOKENS)``. Tokens that belong to a whole chunk, [*B, L] (FAST), know ``chunk``, one
+            ratio for all of them, and ``token``, the mean over them; either counts once for each executed step, and a
+            stop inside the chunk cuts none of them off.
         normalize: ``global`` (the paper) weighs every step equally, ``episode`` every rollout. The latter reads
             ``total_steps`` and the number of rollouts ``num_rollouts`` [*B, 1], or counts both if decisions are
             ``[*rollouts, T]``, time last.
@@ -101,6 +106,7 @@ class LOOPLoss(LossModule):
         action: NestedKey = keys.CHUNK
         sample_log_prob: NestedKey = keys.LOG_PROBS
         step_mask: NestedKey = keys.STEP_MASK
+        token_is_pad: NestedKey = keys.TOKEN_IS_PAD
         mask: NestedKey = keys.MASK
         total_steps: NestedKey = "total_steps"
         num_rollouts: NestedKey = "num_rollouts"
@@ -157,6 +163,7 @@ class LOOPLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         names = self.tensor_keys
         own = [names.action, names.sample_log_prob, names.advantage, names.step_mask]
+        own += [names.token_is_pad] if names.token_is_pad in self.actor_network.out_keys else []
         return [*own, *(key for key in self.actor_network.in_keys if key not in own)]
 
     @dispatch
@@ -170,7 +177,10 @@ class LOOPLoss(LossModule):
         gain = torch.minimum(ratio * advantage, ratio.clamp(1 - low, 1 + high) * advantage)  # World-Env Eq. 5
         gain = torch.where(mask, gain, 0.0)
         if self.ratio_level in _EACH:
-            gain = gain.mean(-1)
+            if gain.ndim == steps.ndim:  # tokens of whole chunks
+                gain = gain.sum(-1, keepdim=True) / mask.sum(-1, keepdim=True).clamp_min(1) * steps
+            else:
+                gain = gain.mean(-1)
         loss = -(gain * self._weight(tensordict, steps, gain.dtype)).sum()
         return TensorDict({"loss_objective": loss} | self._diagnostics(log_ratio.detach(), mask))
 
@@ -181,7 +191,8 @@ class LOOPLoss(LossModule):
         Returns:
             ``ratio`` [*B, C], new over behaviour probability, and ``clipped`` bool [*B, C], whether the clip takes the
             gradient of that step away (a ratio that has left the interval in the direction of its advantage); 1 and
-            False where nothing was executed. Both [*B, C, 7] for ``dim`` and ``token``.
+            False where nothing was executed. Both [*B, C, 7] for ``dim`` and ``token``, and like the tokens of whole
+            chunks, [*B, L], for ``token``.
         """
         tensordict = tensordict.copy()  # the actor writes into it
         log_ratio, mask, advantage = self._compared(tensordict, self._executed(tensordict))
@@ -196,8 +207,11 @@ class LOOPLoss(LossModule):
         chunk, before = tensordict.get(names.action), tensordict.get(names.sample_log_prob)
         if before.requires_grad:
             raise ValueError(f"{names.sample_log_prob} requires grad: collect rollouts under torch.no_grad()")
-        if steps.shape != chunk.shape[:-1]:
-            raise ValueError(f"{names.step_mask} must be {list(chunk.shape[:-1])}, got {list(steps.shape)}")
+        padding = tensordict.get(names.token_is_pad, None)
+        whole = padding is not None and chunk.ndim == steps.ndim  # tokens that belong to the whole chunk
+        if steps.shape[:-1] != chunk.shape[:-1] if whole else steps.shape != chunk.shape[:-1]:
+            wanted = [*chunk.shape[:-1], "C"] if whole else list(chunk.shape[:-1])
+            raise ValueError(f"{names.step_mask} must be {wanted}, got {list(steps.shape)}")
         advantage = tensordict.get(names.advantage, None)
         if advantage is None:
             raise ValueError(
@@ -208,7 +222,8 @@ class LOOPLoss(LossModule):
             raise ValueError(f"{names.advantage} must be {[*steps.shape[:-1], 1]}, got {list(advantage.shape)}")
 
         # Actions that were not executed must not reach the graph: 0 * NaN is NaN, also backwards.
-        chunk = torch.where(steps.unsqueeze(-1), chunk, torch.zeros_like(chunk))  # tokens stay whole numbers
+        executed = steps.any(-1, keepdim=True) if whole else steps.unsqueeze(-1)
+        chunk = torch.where(executed, chunk, torch.zeros_like(chunk))  # tokens stay whole numbers
         tensordict.set(names.action, chunk)  # an autoregressive actor reads them
         now = self._distribution(tensordict).log_prob(chunk)
         if now.shape != before.shape:
@@ -216,7 +231,22 @@ class LOOPLoss(LossModule):
                 f"{names.sample_log_prob} is {list(before.shape)}, the actor scores {list(now.shape)}: "
                 "collect and train with the same event_dims"
             )
+        if whole:
+            return self._whole_log_ratio(now - before, executed & ~padding, steps, advantage)
         return self._log_ratio(now - before, steps, advantage)
+
+    def _whole_log_ratio(
+        self, difference: Tensor, said: Tensor, steps: Tensor, advantage: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """As :meth:`_log_ratio`, of the tokens of whole chunks: [*B, L] one by one, or [*B, C]."""
+        if self.ratio_level not in ("chunk", "token"):
+            raise ValueError(
+                f"ratio_level must be chunk or token for tokens that belong to a whole chunk, got {self.ratio_level!r}"
+            )
+        difference = torch.where(said, difference, 0.0)
+        if self.ratio_level == "token":
+            return difference, said, advantage
+        return difference.sum(-1, keepdim=True).expand(steps.shape), steps, advantage
 
     def _distribution(self, tensordict: TensorDictBase) -> Distribution:
         if self.actor_network_params is not None:

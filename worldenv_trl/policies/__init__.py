@@ -8,6 +8,8 @@ from worldenv_trl.policies.autoregressive import AutoregressiveActor, TeacherFor
 from worldenv_trl.policies.base import Policy
 from worldenv_trl.policies.device_bridge import DeviceBridge
 from worldenv_trl.policies.external import ExternalConfig, ExternalPolicy
+from worldenv_trl.policies.fast import FASTConfig, FASTPolicy
+from worldenv_trl.policies.fast_tokens import FASTActionTokenizer
 from worldenv_trl.policies.flow import FlowConfig, FlowPolicy
 from worldenv_trl.policies.hf import HFConfig, HFPolicy
 from worldenv_trl.policies.hf_tokens import HFTokenConfig, HFTokenPolicy
@@ -26,6 +28,9 @@ __all__ = [
     "DeviceBridge",
     "ExternalConfig",
     "ExternalPolicy",
+    "FASTActionTokenizer",
+    "FASTConfig",
+    "FASTPolicy",
     "FlowConfig",
     "FlowPolicy",
     "HFConfig",

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from worldenv_trl.keys import CHUNK, LOG_PROBS, TOKENS
+from worldenv_trl.keys import CHUNK, LOG_PROBS, TOKEN_IS_PAD, TOKENS
 from worldenv_trl.policies.token_actor import IndependentCategorical
 from worldenv_trl.policies.token_policy import TokenPolicy
 
@@ -27,13 +27,16 @@ class AutoregressiveActor(TensorDictModuleBase):
     :class:`~worldenv_trl.objectives.LOOPLoss` they are the action: ``loss.set_keys(action=keys.TOKENS)``. The
     temperature is part of the density: what is sampled from is what is scored.
 
+    Of a policy that is ``sequential``, ``TOKENS`` are [*B, L], so are ``LOG_PROBS`` (0 of padding), and
+    ``TOKEN_IS_PAD`` tells which of them stand behind the end.
+
     Args:
         policy: that acts.
 
     Keyword Args:
         temperature: positive; the policy's own when None.
         event_dims: 0 for a log-probability of each token [*B, C, 7], which ``ratio_level="token"`` needs, 1 for the
-            steps' [*B, C].
+            steps' [*B, C]. Tokens of a whole chunk have no steps: theirs are always of each token, [*B, L].
 
     Raises:
         TypeError: for a policy that does not act by tokens.
@@ -53,8 +56,11 @@ class AutoregressiveActor(TensorDictModuleBase):
             )
         if event_dims not in (0, 1):
             raise ValueError(f"event_dims must be 0 or 1, got {event_dims}")
-        self.policy, self.temperature, self.event_dims = policy, float(temperature), event_dims
+        self.policy, self.temperature = policy, float(temperature)
+        self.event_dims = 0 if policy.sequential else event_dims
         self.in_keys, self.out_keys = list(policy.in_keys), [TOKENS, CHUNK, LOG_PROBS]
+        if policy.sequential:
+            self.out_keys.append(TOKEN_IS_PAD)
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -62,9 +68,13 @@ class AutoregressiveActor(TensorDictModuleBase):
         batch, observed = self.policy.observed(tensordict)
         tokens, log_probs = self.policy.sample(*observed, self.temperature, greedy)
         tensordict.set(TOKENS, tokens.reshape(*batch, *tokens.shape[1:]))
-        tensordict.set(CHUNK, self.policy.action_tokenizer.decode(tensordict[TOKENS]).float())
+        tensordict.set(CHUNK, self.policy.decode(tensordict[TOKENS]))
+        if self.policy.sequential:
+            tensordict.set(TOKEN_IS_PAD, self.policy.token_is_pad(tensordict[TOKENS]))
         if self.policy.rescored and not greedy:
             scored = self.get_dist(tensordict).log_prob(tensordict[TOKENS])
+            if self.policy.sequential:
+                scored = scored.masked_fill(tensordict[TOKEN_IS_PAD], 0.0)
         else:
             scored = log_probs.sum(-1) if self.event_dims else log_probs
             scored = scored.reshape(*batch, *scored.shape[1:])
@@ -89,6 +99,8 @@ class TeacherForcing(TensorDictModuleBase):
 
         loss = BCLoss(TeacherForcing(policy), loss_function=token_cross_entropy)
         loss.set_keys(action=keys.TOKENS, pad_mask=keys.ACTION_IS_PAD)
+
+    Tokens of a whole chunk are [*B, L], and ``keys.TOKEN_IS_PAD`` is their mask.
 
     Args:
         policy: that is taught.
@@ -116,5 +128,5 @@ def token_cross_entropy(logits: Tensor, tokens: Tensor) -> Tensor:
 def _teacher_forced(policy: TokenPolicy, tensordict: TensorDictBase) -> Tensor:
     _batch, observed = policy.observed(tensordict)
     tokens = tensordict[TOKENS]
-    logits = policy.logits(*observed, tokens.reshape(-1, *tokens.shape[-2:]))
+    logits = policy.logits(*observed, tokens.reshape(-1, *policy.token_shape))
     return logits.reshape(*tokens.shape, logits.shape[-1])

@@ -27,6 +27,8 @@ class TokenBackbone(VisionLanguageBackbone):
 
     Args:
         model, token_ids, first_id: see :class:`~worldenv_trl.policies.hf_backbone.VisionLanguageBackbone`.
+        opening: ids of tokens that are said before the first one in every row. Unlike the prompt's, they see only what
+            is before them, and no prompt sees them.
     """
 
     def __init__(
@@ -35,8 +37,10 @@ class TokenBackbone(VisionLanguageBackbone):
         *,
         token_ids: tuple[Sequence[int], Sequence[int]] = ((), ()),
         first_id: int | None = None,
+        opening: Sequence[int] = (),
     ) -> None:
         super().__init__(model, token_ids=token_ids, first_id=first_id)
+        self.opening = tuple(opening)
 
     def forward(self, pixels: Tensor, ids: Tensor, valid: Tensor, tokens: Tensor) -> Tensor:  # type: ignore[override]
         """What each token is predicted from, [n, T, dim], in one pass.
@@ -61,7 +65,13 @@ class TokenBackbone(VisionLanguageBackbone):
 
     @torch.no_grad()
     def generate(
-        self, pixels: Tensor, ids: Tensor, valid: Tensor, count: int, choose: Callable[[Tensor], Tensor]
+        self,
+        pixels: Tensor,
+        ids: Tensor,
+        valid: Tensor,
+        count: int,
+        choose: Callable[[Tensor], Tensor],
+        ended: Callable[[], bool] | None = None,
     ) -> Tensor:
         """Tokens int64 [n, count], one after the other; keys and values of what came before are kept.
 
@@ -69,6 +79,7 @@ class TokenBackbone(VisionLanguageBackbone):
             pixels, ids, valid: see :meth:`forward`.
             count: of the tokens.
             choose: from hidden states [n, dim] to the ids of the next tokens, int64 [n].
+            ended: asked after each token whether the rest is not wanted: [n, fewer] then.
         """
         from transformers import DynamicCache
 
@@ -86,6 +97,8 @@ class TokenBackbone(VisionLanguageBackbone):
                     use_cache=True,
                 ).last_hidden_state
                 tokens.append(choose(hidden[:, -1]))
+                if ended is not None and ended():
+                    break
                 part, begin = embed(tokens[-1][:, None]).to(dtype), end
         return torch.stack(tokens, 1)
 
@@ -93,9 +106,12 @@ class TokenBackbone(VisionLanguageBackbone):
         """The sequence [n, S, dim] ahead of the first token; mask and positions with room for ``behind`` tokens."""
         front, sides = self._front(pixels, ids.device)
         dtype = front[sides[0]].dtype
-        prompt = torch.cat([*front, self.language_model.get_input_embeddings()(ids)], 1).to(dtype)
+        parts = [*front, self.language_model.get_input_embeddings()(ids)]
+        if self.opening:
+            parts.append(self._tokens(self.opening, ids.shape[0], ids.device))
+        behind += len(self.opening)
         seen = self._seen(valid, front, behind)
-        return prompt, self._allowed(seen, behind), self._positions(seen, front, sides)
+        return torch.cat(parts, 1).to(dtype), self._allowed(seen, behind), self._positions(seen, front, sides)
 
     def _allowed(self, seen: Tensor, behind: int) -> Tensor:
         """Bool [n, S, S]: every token sees those before it, and a prefix that sees itself all of the prefix."""

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from worldenv_trl.keys import ACTION_DIM
 from worldenv_trl.policies.action_tokens import QuantileActionTokenizer
-from worldenv_trl.policies.hf_backbone import autocast, full_precision
-from worldenv_trl.policies.hf_token_backbone import TokenBackbone
-from worldenv_trl.policies.token_policy import TokenPolicy
-from worldenv_trl.policies.vision_language import VisionLanguageConfig, VisionLanguagePolicy
+from worldenv_trl.policies.hf_backbone import autocast
+from worldenv_trl.policies.language_tokens import LanguageTokenPolicy
+from worldenv_trl.policies.vision_language import VisionLanguageConfig
 from worldenv_trl.row_share import own_rows
 
 if TYPE_CHECKING:
@@ -61,14 +60,12 @@ class HFTokenConfig(VisionLanguageConfig):
             raise ValueError(f"temperature must be positive, got {self.temperature}")
 
 
-class HFTokenPolicy(TokenPolicy, VisionLanguagePolicy):
+class HFTokenPolicy(LanguageTokenPolicy):
     """Maps images and a prompt to the tokens of an action chunk, one after the other.
 
     A vision-language model goes on its prompt with 7 tokens for each action. Only the ``num_bins`` ids before
-    ``action_token_end`` can be drawn: a token's probability is the softmax over these. What reads them out are the rows
-    of the model's language head that belong to them, ``action_head``, which learns in full; the embeddings by which the
-    model reads its own tokens again are the backbone's. Families:
-    :data:`~worldenv_trl.policies.hf_backbone.FAMILIES`.
+    ``action_token_end`` can be drawn; see :class:`~worldenv_trl.policies.language_tokens.LanguageTokenPolicy`.
+    Families: :data:`~worldenv_trl.policies.hf_backbone.FAMILIES`.
 
     Args:
         config: its settings.
@@ -91,11 +88,9 @@ class HFTokenPolicy(TokenPolicy, VisionLanguagePolicy):
     ) -> None:
         super().__init__(config, tokenizer)
         model, tokens = self._make_model(model)
-        self.backbone = TokenBackbone(model, **tokens)
         text = model.config.get_text_config()
         self.first_action_id = self._find_action_tokens(int(text.vocab_size), tokens)
-        self._logit_cap: float | None = getattr(text, "final_logit_softcapping", None)
-        self.action_head = nn.Linear(self.backbone.dim, config.num_bins, bias=False)
+        self._make_readout(model, tokens, range(self.first_action_id, self.first_action_id + config.num_bins))
         self.action_tokenizer = QuantileActionTokenizer(config.num_bins)
         self.temperature, self.rescored = config.temperature, self._dtype != torch.float32
         self._prepare_learning()
@@ -127,31 +122,6 @@ class HFTokenPolicy(TokenPolicy, VisionLanguagePolicy):
         shape = (self.chunk_length, ACTION_DIM)
         return (tokens - self.first_action_id).unflatten(1, shape), torch.stack(scores, 1).unflatten(1, shape)
 
-    def logits(
-        self, images: Mapping[str, Tensor], state: Tensor, instructions: Sequence[str], tokens: Tensor
-    ) -> Tensor:
-        ids, valid = self._prompt_tensors(instructions, state)
-        with autocast(state.device, self._dtype):
-            hidden = self.backbone(self._pixels(images), ids, valid, tokens.flatten(1) + self.first_action_id)
-        return self._logits(hidden).unflatten(1, tokens.shape[1:])
-
-    def _logits(self, hidden: Tensor) -> Tensor:
-        with full_precision(hidden.device):
-            logits = self.action_head(hidden.float())
-        if self._logit_cap is not None:
-            logits = self._logit_cap * torch.tanh(logits / self._logit_cap)
-        return logits
-
-    def head_parameters(self) -> list[nn.Parameter]:
-        """What reads action tokens out."""
-        return list(self.action_head.parameters())
-
-    @torch.no_grad()
-    def take_output_embeddings(self, rows: Tensor) -> None:
-        """Reads action tokens out as a pretrained language head does, [vocabulary, dim]."""
-        if not rows.is_meta:  # an outline has no weights to give
-            self.action_head.weight.copy_(rows[self.first_action_id : self.first_action_id + self.config.num_bins])
-
     def _set_action_bounds(self, center: Tensor, half: Tensor) -> None:
         self.action_tokenizer.set_bounds(center - half, center + half)
 
@@ -171,16 +141,7 @@ class HFTokenPolicy(TokenPolicy, VisionLanguagePolicy):
                 f"the tokenizer has no token of the ids {_ranges(missing)}, and {begin} to {end - 1} stand for "
                 "actions: take the tokenizer of this backbone, or name another action_token_end"
             )
-        around = tokens["token_ids"]
-        used = [*around[0], *around[1], *self.config.prompt_end]  # type: ignore[index]
-        used += [] if tokens["first_id"] is None else [tokens["first_id"]]
-        taken = sorted({number for number in used if begin <= number < end})
-        if taken:
-            names = ", ".join(repr(tokenizer.id_to_token(number)) for number in taken)
-            raise ValueError(
-                f"the ids {begin} to {end - 1} stand for actions, and the prompt needs {names} among them: name "
-                "another action_token_end"
-            )
+        self._check_free(begin, end, tokens, "name another action_token_end")
         return begin
 
 

@@ -17,6 +17,7 @@ def prepare_images(
     images: Tensor,
     size_px: int,
     *,
+    resize: str = "lanczos",
     rotation: int = 0,
     mirror: bool = False,
     crop_area: float = 1.0,
@@ -30,6 +31,7 @@ def prepare_images(
         size_px: side of the result.
 
     Keyword Args:
+        resize: ``lanczos``, or ``bilinear`` (openpi's, without antialiasing).
         rotation: degrees against the clock, a multiple of 90. LIBERO's raw images need 180.
         mirror: exchange left and right after that. Upright images mirrored are LIBERO's raw ones, whose rows run
             upwards, turned by 180.
@@ -51,7 +53,7 @@ def prepare_images(
         images = torch.rot90(images, rotation // 90, (-2, -1))
     if mirror:
         images = images.flip(-1)
-    pixels = lanczos_resize(images, size_px)
+    pixels = lanczos_resize(images, size_px) if resize == "lanczos" else 255 * bilinear_resize(images, size_px)
     if crop_area < 1:
         pixels = centre_crop(pixels, crop_area)
     center, spread = (torch.tensor(each, device=pixels.device)[:, None, None] for each in (mean, std))

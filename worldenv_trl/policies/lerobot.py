@@ -1,4 +1,4 @@
-"""LeRobot's folders of SmolVLA, pi0 and pi0.5 as a :class:`~worldenv_trl.policies.FlowPolicy`."""
+"""LeRobot's folders: SmolVLA, pi0 and pi0.5 as a :class:`~worldenv_trl.policies.FlowPolicy`, and pi0-FAST."""
 
 from __future__ import annotations
 
@@ -17,10 +17,14 @@ from worldenv_trl.policies.flow import FlowConfig, FlowPolicy, make_network
 from worldenv_trl.policies.flow_network import FLOW_FAMILIES, FlowNetwork
 from worldenv_trl.policies.hf_backbone import backbone_config
 from worldenv_trl.policies.hf_files import read_json, read_tokenizer
+from worldenv_trl.policies.lerobot_fast import PI0_FAST, load_pi0_fast
 from worldenv_trl.policies.lerobot_files import Affine, LeRobotFolder, read_lerobot_folder
+from worldenv_trl.policies.lerobot_weights import assign_weights, named_shapes, named_tensors, paligemma_sizes
 
 if TYPE_CHECKING:
     from tokenizers import Tokenizer
+
+    from worldenv_trl.policies.fast import FASTPolicy
 
 __all__ = ["load_lerobot"]
 
@@ -28,26 +32,10 @@ STATE, ACTION = "observation.state", "action"
 CAMERAS = ("agentview", "wrist")
 DTYPE = "bfloat16"  # of the towers, where nothing else is asked for
 PALIGEMMA = "google/paligemma-3b-pt-224"  # whose tokenizer pi0 and pi0.5 read with
-VISION_HEADS = 16  # of PaliGemma's SigLIP; shapes of weights do not tell
+_LAST_NORM = re.compile(r"backbone\.model\.(text_model|language_model)\.norm\.")
 _NEEDED = ("chunk_size", "max_state_dim", "max_action_dim", "tokenizer_max_length")
 # What other robots and other trainings switch on, and is not done here.
 _UNKNOWN = ("adapt_to_pi_aloha", "use_relative_actions", "use_visual_memory", "use_proprioceptive_memory")
-_RENAMED = (
-    (r"^model\.", ""),
-    (r"^vlm_with_expert\.vlm\.model\.", "backbone.model."),
-    (r"^vlm_with_expert\.vlm\.", "backbone."),
-    (r"^vlm_with_expert\.lm_expert\.", "expert."),
-    (r"^paligemma_with_expert\.paligemma\.(model\.)?", "backbone.model."),
-    (r"^paligemma_with_expert\.gemma_expert\.(model\.)?", "expert."),
-    (r"^backbone\.model\.language_model\.model\.", "backbone.model.language_model."),  # before transformers 4.52
-    (r"^backbone\.model\.vision_tower\.vision_model\.", "backbone.model.vision_tower."),  # before transformers 5.6
-    (r"^action_time_mlp_", "time_mlp_"),
-)
-# Nothing of the flow reads these.
-_UNUSED = re.compile(
-    r"^expert\.(lm_head|embed_tokens)\.|rotary_emb\.|^backbone\.model\.vision_tower\.head\.|"
-    r"^backbone\.model\.(text_model|language_model)\.norm\."
-)
 
 
 def load_lerobot(
@@ -56,12 +44,14 @@ def load_lerobot(
     cameras: Sequence[str] | None = None,
     image_features: Sequence[str] | None = None,
     backbone: str | os.PathLike | None = None,
+    action_tokenizer: str | os.PathLike | None = None,
     device: str | torch.device = "cpu",
     **settings: Any,
-) -> FlowPolicy:
-    """The policy of a folder that LeRobot wrote, of type ``smolvla``, ``pi0`` or ``pi05``.
+) -> FlowPolicy | FASTPolicy:
+    """The policy of a folder that LeRobot wrote, of type ``smolvla``, ``pi0``, ``pi05`` or ``pi0_fast``.
 
-    Network and statistics are the checkpoint's; the scale head is new, for a flow has none: train it before LOOP. Its
+    Network and statistics are the checkpoint's; the scale head is new, for a flow has none: train it before LOOP
+    (pi0-FAST, a :class:`~worldenv_trl.policies.FASTPolicy`, acts by tokens and needs none). Its
     actions must be 7 numbers in the env's convention, and its proprioception LIBERO's 8 or the env's 7, unless the
     statistics are fitted to other data (``fixed_statistics=False``): then what it was trained on is only where
     fine-tuning begins. Images are as the checkpoint's data set has them: ``mirror=True`` for LIBERO's.
@@ -78,22 +68,31 @@ def load_lerobot(
         backbone: folder, or repository, of the vision-language model, of which ``tokenizer.json`` and, for SmolVLA,
             ``config.json`` are read. When None, ``tokenizer.json`` or ``tokenizer/`` of the policy's own folder, and
             what its config names.
+        action_tokenizer: folder, or repository, of pi0-FAST's, as :meth:`FASTActionTokenizer.from_pretrained` reads it.
+            When None, ``action_tokenizer/`` of the policy's own folder, or what its config names.
         device: of the parameters; on ``meta`` no weights are read.
-        settings: other fields of :class:`~worldenv_trl.policies.FlowConfig`; ``chunk_length`` is the policy's
-            ``n_action_steps``, ``dtype`` bfloat16 and ``lora_rank`` 32 unless they say otherwise.
+        settings: other fields of :class:`~worldenv_trl.policies.FlowConfig`, or of
+            :class:`~worldenv_trl.policies.FASTConfig`; ``chunk_length`` is the policy's ``n_action_steps``, ``dtype``
+            bfloat16 and ``lora_rank`` 32 unless they say otherwise.
 
     Raises:
         FileNotFoundError: if a file is missing.
         ValueError: for another kind or type of checkpoint, pickled weights, another number of cameras, a missing
             statistic, features that are not this arm's, or weights that do not fit.
     """
-    read = read_lerobot_folder(folder, tuple(FLOW_FAMILIES))
+    read = read_lerobot_folder(folder, (*FLOW_FAMILIES, PI0_FAST))
     wanted = tuple(image_features or read.image_features)
     cameras = CAMERAS[: len(wanted)] if cameras is None else tuple(cameras)
     _check(read, cameras, wanted)
     tokenizer, described = _backbone(read, backbone)
     fixed = bool(settings.get("fixed_statistics", True))
-    config = FlowConfig(**(_settings(read, _shapes(read), described, fixed) | {"cameras": cameras} | settings))
+    _check_arm(read, fixed)
+    if read.kind == PI0_FAST:
+        statistics = (read.normalizer(STATE), read.normalizer(ACTION)) if fixed else None
+        settings = {"cameras": cameras} | settings
+        where, half = torch.device(device), read.half_range(ACTION)
+        return load_pi0_fast(read, tokenizer, action_tokenizer, statistics, half, where, settings)
+    config = FlowConfig(**(_settings(read, named_shapes(read), described, fixed) | {"cameras": cameras} | settings))
     statistics = (read.normalizer(STATE), read.normalizer(ACTION)) if fixed else None
     policy = FlowPolicy(config, tokenizer, _network(config, tokenizer, read, torch.device(device)))
     if statistics is not None:
@@ -132,10 +131,7 @@ def _check(read: LeRobotFolder, cameras: Sequence[str], wanted: Sequence[str]) -
             )
 
 
-def _settings(
-    read: LeRobotFolder, shapes: Mapping[str, Sequence[int]], described: Mapping[str, Any], fixed: bool
-) -> dict[str, Any]:
-    fields, layers = read.fields, "expert.layers."
+def _check_arm(read: LeRobotFolder, fixed: bool) -> None:
     state, action = read.inputs[STATE].shape, read.outputs[ACTION].shape
     if fixed and (action != (ACTION_DIM,) or state not in ((STATE_DIM,), (STATE_DIM + 1,))):
         raise ValueError(
@@ -143,6 +139,13 @@ def _settings(
             f"[{STATE_DIM}] (LIBERO's: [{STATE_DIM + 1}]) and [{ACTION_DIM}]: fixed_statistics=False begins with "
             "its weights and normalises by your data"
         )
+
+
+def _settings(
+    read: LeRobotFolder, shapes: Mapping[str, Sequence[int]], described: Mapping[str, Any], fixed: bool
+) -> dict[str, Any]:
+    fields, layers = read.fields, "expert.layers."
+    state = read.inputs[STATE].shape
     # Of a mask of another shape than a square's, padding would have to be made.
     side = fields.get("resize_imgs_with_padding" if read.kind == "smolvla" else "image_resolution", (224, 224))
     if not side or side[0] != side[1]:
@@ -156,7 +159,7 @@ def _settings(
         "num_hidden_layers": count,
     }
     crossing = read.kind == "smolvla" and "cross" in fields.get("attention_mode", "cross_attn")
-    network = _smolvlm(described, shapes, fields) if read.kind == "smolvla" else _paligemma(read, shapes, side[0])
+    network = _smolvlm(described, shapes, fields) if read.kind == "smolvla" else paligemma_sizes(read, shapes, side[0])
     mean_std = read.normalization.get("ACTION") == "MEAN_STD"
     return {
         "kind": read.kind,
@@ -194,46 +197,6 @@ def _smolvlm(
     return described
 
 
-def _paligemma(read: LeRobotFolder, shapes: Mapping[str, Sequence[int]], side: int) -> dict[str, Any]:
-    """Sizes as the weights have them; what sizes do not tell, as all of openpi's have it."""
-    text, vision = "backbone.model.language_model.", "backbone.model.vision_tower."
-    patch = f"{vision}embeddings.patch_embedding.weight"
-    keys, queries = (f"{text}layers.0.self_attn.{each}_proj.weight" for each in "kq")
-    if patch not in shapes or keys not in shapes:
-        raise ValueError(f"{read.folder} holds no weights of a PaliGemma: this is no {read.kind} of LeRobot")
-    count = {
-        name: 1 + max(int(each.split(".")[at]) for each in shapes if each.startswith(name))
-        for name, at in ((f"{text}layers.", 4), (f"{vision}encoder.layers.", 5))
-    }
-    head_dim, width = shapes[keys]
-    return {
-        "model_type": "paligemma",
-        "projection_dim": width,
-        "image_token_index": shapes[f"{text}embed_tokens.weight"][0],
-        "text_config": {
-            "model_type": "gemma",
-            "hidden_size": width,
-            "intermediate_size": shapes[f"{text}layers.0.mlp.gate_proj.weight"][0],
-            "num_hidden_layers": count[f"{text}layers."],
-            "num_attention_heads": shapes[queries][0] // head_dim,
-            "num_key_value_heads": 1,
-            "head_dim": head_dim,
-            "vocab_size": shapes[f"{text}embed_tokens.weight"][0],
-        },
-        "vision_config": {
-            "model_type": "siglip_vision_model",
-            "vision_use_head": False,
-            "hidden_size": shapes[patch][0],
-            "intermediate_size": shapes[f"{vision}encoder.layers.0.mlp.fc1.weight"][0],
-            "num_hidden_layers": count[f"{vision}encoder.layers."],
-            "num_attention_heads": VISION_HEADS,
-            "patch_size": shapes[patch][-1],
-            "image_size": side,
-            "projection_dim": width,
-        },
-    }
-
-
 def _backbone(read: LeRobotFolder, named: str | os.PathLike | None) -> tuple[Tokenizer, dict[str, Any]]:
     """The tokenizer and, of SmolVLA's, the fields of the backbone's config: weights do not tell all of its sizes."""
     smolvla = read.kind == "smolvla"
@@ -260,40 +223,6 @@ def _backbone(read: LeRobotFolder, named: str | os.PathLike | None) -> tuple[Tok
     return read_tokenizer(own or folder), described
 
 
-def _renamed(read: LeRobotFolder, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
-    """Weights by the names of :class:`~worldenv_trl.policies.flow_network.FlowNetwork`; its towers' in ``dtype``."""
-    tensors = {}
-    for old, tensor in read.tensors():
-        name = _name(old)
-        if name is not None:
-            tower = name.startswith(("backbone.", "expert."))
-            tensors[name] = tensor.to(device, dtype if tower else torch.float32)
-    return _untied(tensors)
-
-
-def _shapes(read: LeRobotFolder) -> dict[str, Any]:
-    """Shapes of these, without reading them."""
-    return _untied({name: shape for name, shape in ((_name(name), shape) for name, shape in read.shapes()) if name})
-
-
-def _name(name: str) -> str | None:
-    for pattern, new in _RENAMED:
-        name = re.sub(pattern, new, name)
-    return None if _UNUSED.search(name) else name
-
-
-def _untied(found: dict[str, Any]) -> dict[str, Any]:
-    """Embeddings that were saved once, as the weights of the language-modelling head, under their own name."""
-    heads = [name for name in found if name.endswith("lm_head.weight")]
-    for name in heads:
-        head = found.pop(name)
-        text = (
-            "text_model" if any(each.startswith("backbone.model.text_model.") for each in found) else "language_model"
-        )
-        found.setdefault(f"backbone.model.{text}.embed_tokens.weight", head)
-    return found
-
-
 def _network(config: FlowConfig, tokenizer: Tokenizer, read: LeRobotFolder, device: torch.device) -> FlowNetwork:
     from transformers.initialization import no_init_weights
 
@@ -302,22 +231,17 @@ def _network(config: FlowConfig, tokenizer: Tokenizer, read: LeRobotFolder, devi
             return make_network(config, tokenizer)
     with no_init_weights():  # billions of random numbers take minutes
         network = make_network(config, tokenizer)
-    state, wanted = _renamed(read, getattr(torch, config.dtype), device), network.state_dict()
+    state, wanted = named_tensors(read, getattr(torch, config.dtype), device), network.state_dict()
     prefix = (
         "backbone.model.text_model.layers." if config.kind == "smolvla" else "backbone.model.language_model.layers."
     )
+    # Nothing of the flow reads the last norm.
+    state = {name: tensor for name, tensor in state.items() if not _LAST_NORM.match(name)}
     # Layers of the language model that were never used, and what is behind the last one's keys and values.
     last = config.backbone["text_config"]["num_hidden_layers"] - 1
     spare = [name for name in state if name not in wanted and name.startswith(prefix)]
     kept = {name: tensor for name, tensor in state.items() if name not in spare or int(name.split(".")[4]) < last}
-    missing, unknown = sorted(set(wanted) - set(kept)), sorted(set(kept) - set(wanted))
-    wrong = [name for name in wanted if name in kept and wanted[name].shape != kept[name].shape]
-    if missing or unknown or wrong:
-        found = [f"{len(missing)} tensors are missing ({', '.join(missing[:2])})"] if missing else []
-        found += [f"{len(unknown)} are unknown ({', '.join(unknown[:2])})"] if unknown else []
-        found += [f"{name} is {list(kept[name].shape)}, not {list(wanted[name].shape)}" for name in wrong[:1]]
-        raise ValueError(f"{read.folder} does not hold the network of its config: {'; '.join(found)}")
-    network.load_state_dict({name: tensor.to(wanted[name].dtype) for name, tensor in kept.items()}, assign=True)
+    assign_weights(network, kept, read)
     return network
 
 

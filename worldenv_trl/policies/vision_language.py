@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -122,7 +122,8 @@ class VisionLanguagePolicy(Policy, Pretrained):
         tokenizer: of the backbone; saved beside the weights as ``tokenizer.json``.
     """
 
-    companion_names = (TOKENIZER_NAME,)
+    companion_names: ClassVar[tuple[str, ...]] = (TOKENIZER_NAME,)
+    resize = "lanczos"
     config: VisionLanguageConfig
     backbone: Any
     state_low: Tensor
@@ -279,6 +280,7 @@ class VisionLanguagePolicy(Policy, Pretrained):
         return prepare_images(
             torch.stack([images[camera] for camera in self.cameras], 1),
             config.resolution,
+            resize=self.resize,
             rotation=config.rotation,
             mirror=config.mirror,
             crop_area=config.crop_area,
@@ -297,11 +299,20 @@ class VisionLanguagePolicy(Policy, Pretrained):
         known = self._prompts.get(instruction) if not state else None
         if known is not None:
             return known
-        text = self.config.prompt.replace("{instruction}", instruction.lower()).replace("{state}", state)
+        text = self.config.prompt.replace("{instruction}", self._worded(instruction)).replace("{state}", state)
         ids = [*self.tokenizer.encode(text, add_special_tokens=False).ids, *self.config.prompt_end]
         if not state:
             self._prompts[instruction] = ids
         return ids
+
+    def _worded(self, instruction: str) -> str:
+        """As it stands in the prompt."""
+        return instruction.lower()
+
+    def _state_bins(self, state: Tensor) -> list[list[int]]:
+        """The numbers of proprioception [n, 7] as they stand in a prompt with ``{state}``."""
+        bins = ((self._normalized_proprio(state) + 1) * (STATE_BINS / 2)).long().clamp(max=STATE_BINS - 1)
+        return bins.tolist()
 
     @torch.compiler.disable  # see Policy._goals
     def _prompt_tensors(self, instructions: Sequence[str], state: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -313,8 +324,7 @@ class VisionLanguagePolicy(Policy, Pretrained):
         """
         told = [""] * len(instructions)
         if state is not None and "{state}" in self.config.prompt:
-            bins = ((self._normalized_proprio(state) + 1) * (STATE_BINS / 2)).long().clamp(max=STATE_BINS - 1)
-            told = [" ".join(map(str, row)) for row in bins.tolist()]
+            told = [" ".join(map(str, row)) for row in self._state_bins(state)]
         rows = tuple(tuple(self._prompt_ids(text, seen)) for text, seen in zip(instructions, told, strict=True))
         ids, valid = _padded(rows, self._longest)
         device = self.state_low.device
