@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 
 import torch
@@ -11,7 +12,17 @@ from transformers import LlavaConfig, PretrainedConfig, SmolVLMConfig
 from published_sizes import INSTRUCTION, LLAMA_2_7B, openvla_oft_7b, paligemma_3b, siglip_so400m, words
 from real_size_row import Row
 from worldenv_trl.keys import ACTION_DIM, STATE_DIM
-from worldenv_trl.policies import HFConfig, HFPolicy, HFTokenConfig, HFTokenPolicy, Policy, token_cross_entropy
+from worldenv_trl.policies import (
+    FASTConfig,
+    FASTPolicy,
+    HFConfig,
+    HFPolicy,
+    HFTokenConfig,
+    HFTokenPolicy,
+    Policy,
+    TokenPolicy,
+    token_cross_entropy,
+)
 from worldenv_trl.policies.prismatic import PrismaticConfig
 
 CAMERAS = ("agentview", "wrist")
@@ -105,17 +116,32 @@ def make_tokens() -> HFTokenPolicy:
     return HFTokenPolicy(config, words(ACTION_IDS))
 
 
-def cross_entropy(policy: HFTokenPolicy, observed: Inputs) -> Tensor:
-    """Of one token for every number of the chunk: the pass that cloning and LOOP make."""
-    rows = observed[1].shape[0]
-    tokens = torch.zeros(rows, policy.chunk_length, ACTION_DIM, dtype=torch.int64, device=observed[1].device)
+def make_whole_chunks() -> FASTPolicy:
+    """pi0-FAST-3B: chunks of eight actions, said in as many tokens as they have numbers, which is the most."""
+    config = FASTConfig(
+        backbone=paligemma_3b().to_dict(),
+        instructions=(INSTRUCTION,),
+        cameras=CAMERAS,
+        image_size=IMAGE_SIZE,
+        action_token_end=257152,
+        fast_vocab_size=2048,
+        lora_rank=RANK,
+        dtype="bfloat16",
+        gradient_checkpointing=True,
+    )
+    return FASTPolicy(config, words())
+
+
+def cross_entropy(policy: TokenPolicy, observed: Inputs) -> Tensor:
+    """Of a whole chunk's tokens: the pass that cloning and LOOP make."""
+    tokens = torch.zeros(observed[1].shape[0], *policy.token_shape, dtype=torch.int64, device=observed[1].device)
     return token_cross_entropy(policy.logits(*observed, tokens), tokens).mean()
 
 
-def read_by_later_tokens(policy: HFTokenPolicy) -> int:
+def read_by_later_tokens(policy: HFTokenPolicy | FASTPolicy) -> int:
     """The language model's layers and the head, for every token but the first."""
     read = [*policy.backbone.language_model.layers.parameters(), *policy.action_head.parameters()]
-    return (policy.chunk_length * ACTION_DIM - 1) * sum(each.numel() * each.element_size() for each in read)
+    return (math.prod(policy.token_shape) - 1) * sum(each.numel() * each.element_size() for each in read)
 
 
 def compile_layers(policy: nn.Module) -> None:
@@ -144,6 +170,17 @@ ROWS = (
         name="policy-openvla-7b-tokens",
         unit="decision",
         make=make_tokens,
+        inputs=inputs,
+        call=decide,
+        train=learning,
+        loss=cross_entropy,
+        compile=compile_layers,
+        read_again=read_by_later_tokens,
+    ),
+    Row(
+        name="policy-pi0-fast-3b",
+        unit="decision",
+        make=make_whole_chunks,
         inputs=inputs,
         call=decide,
         train=learning,
