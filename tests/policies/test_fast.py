@@ -65,12 +65,12 @@ def slow_log_probs(policy: FASTPolicy, td: TensorDict, temperature: float) -> li
 
 @pytest.mark.parametrize("family", [family for family in FAMILIES if family != "prismatic"])
 def test_one_pass_scores_sequences_as_they_were_drawn_one_by_one(family):
-    policy = fast_policy(family)
-    draws = ((each, drawn(policy, temperature=each)) for each in (1.3, 2.5, 5.0, 10.0, 20.0))
-    # They end by themselves, and differ; at which temperature depends on the weights.
-    temperature, td = next((each, td) for each, td in draws if (~td[keys.TOKEN_IS_PAD]).sum(-1).unique().numel() > 1)
+    policy, temperature = fast_policy(family), 6.0 if family.startswith("paligemma") else 1.3  # some end early
+    td = drawn(policy, temperature=temperature)
     tokens, pad = td[keys.TOKENS], td[keys.TOKEN_IS_PAD]
     assert tokens.dtype == torch.int64 and tokens.shape == pad.shape == td[keys.LOG_PROBS].shape == (6, MAX_TOKENS)
+    lengths = (~pad).sum(-1)
+    assert lengths.min() < MAX_TOKENS and lengths.unique().numel() > 1  # they end by themselves, and differ
     assert (tokens[pad] == policy.action_tokenizer.end).all() and not td[keys.LOG_PROBS][pad].any()
     assert ((tokens < policy.action_tokenizer.known) | (tokens == policy.action_tokenizer.end)).all()
     assert torch.equal(td[keys.CHUNK], policy.action_tokenizer.decode(tokens))
