@@ -128,7 +128,7 @@ def test_a_decision_of_tokens_is_planned(tiny, folder):
 
 
 def test_what_does_not_suit_a_token_policy_is_named(tiny, folder, tmp_path):
-    with pytest.raises(ValueError, match="action_head must be one of continuous, tokens, got 'regression'"):
+    with pytest.raises(ValueError, match="action_head must be one of continuous, tokens, fast, got 'regression'"):
         size = RealSize(policy=folder, action_head="regression")
         REAL_SIZE.policy.make(real(tiny, folder, real_size=size))
     (tmp_path / "config.json").write_text('{"model_type": "openvla"}')
