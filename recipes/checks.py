@@ -133,8 +133,13 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     latest = config.post_train.branch_until
     if config.post_train.branch_share and not config.chunk_length <= latest < config.max_steps:
         raise ValueError(
-            f"post_train.branch_until must be at least {config.chunk_length}, chunk_length, and below "
-            f"{config.max_steps}, max_steps, got {latest}"
+            f"post_train.branch_until, the last step of a branch, must be at least {config.chunk_length}, "
+            f"chunk_length, and below {config.max_steps}, max_steps, got {latest}"
+        )
+    if config.post_train.branch_share and config.post_train.env == "imagined" and config.post_train.iterations < 3:
+        raise ValueError(
+            "post_train.iterations must be at least 3 with post_train.branch_share: the first and the last begin at "
+            f"initial states, got {config.post_train.iterations}"
         )
     if not 0 < config.post_train.false_alarm_rate < 1:
         raise ValueError(

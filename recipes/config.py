@@ -133,7 +133,8 @@ class PostTrain:
     group are expected to differ: groups that all succeed or all fail teach nothing)."""
     branch_share: float = 0.0
     """Share of the groups that begin in imagination in the middle of an explored episode, on its real frames, instead
-    of at an initial state. Waves that are recorded have none: they are relived in the physics."""
+    of at an initial state. Waves that are recorded, the first and the last, have none: they are relived in the
+    physics."""
     branch_until: int = 40
     """The last step at which they begin."""
     epochs: int = 4

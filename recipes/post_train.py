@@ -129,6 +129,8 @@ def post_train(
         metrics |= _wave_metrics(mine, returns, config.tasks)
         if sampler is not None:
             metrics["contexts_seen"] = len(sampler)
+        if imagination is not None and imagination.branch_points is not None:
+            metrics["branched"] = processes.gathered(mine[keys.NUM_STEPS][:, 0, 0, 0] > 0).float().mean().item()
         metrics["iteration_seconds"], started = time.monotonic() - started, time.monotonic()
         if iteration in probed:
             metrics |= processes.on_main(lambda: probe(run, mean_actor, imagination, alarm))

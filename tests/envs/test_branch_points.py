@@ -168,15 +168,23 @@ def test_the_reflector_has_seen_the_beginning_too():
     ("change", "message"),
     [
         ({"share": 1.5}, "share must lie between 0 and 1, got 1.5"),
-        ({"latest": 0}, "latest must be at least 1"),
-        ({"chunk_length": 3}, "at every 3 steps up to 8"),
-        ({"latest": STEPS}, "before the end"),
+        ({"latest": C - 1}, "latest a whole number not below it, got 4 and 3"),
+        ({"chunk_length": 3}, "chunk_length=3 and latest=8, the rollouts have chunks of 4"),
+        ({"latest": STEPS}, "latest below max_steps"),
     ],
 )
 def test_refusals(change, message):
     options = {"chunk_length": C, "share": 1.0, "latest": 2 * C} | change
     with pytest.raises(ValueError, match=message):
         make_env(branch_points=BranchPoints(recorded(), options.pop("chunk_length"), **options))
+
+
+def test_a_share_that_is_assigned_and_points_that_are_read_together_are_checked():
+    points = BranchPoints(recorded(), C, share=1.0, latest=2 * C)
+    with pytest.raises(ValueError, match="share must lie between 0 and 1, got nan"):
+        points.share = float("nan")
+    with pytest.raises(ValueError, match=r"the same step, got \[4, 8\]"):
+        points.past(torch.tensor([0, 1]))
 
 
 def test_episodes_must_be_labelled_and_show_what_the_world_model_paints():

@@ -176,6 +176,22 @@ def test_a_missing_file_is_named(tmp_path, name):
         FASTActionTokenizer.from_pretrained(tmp_path, 8)
 
 
+@pytest.mark.parametrize("content", ["", "{}", "null"])
+def test_a_damaged_tokenizer_is_named(tmp_path, content):
+    FASTActionTokenizer(4, size=60).save_pretrained(tmp_path)
+    (tmp_path / "tokenizer.json").write_text(content)
+    with pytest.raises(ValueError, match=r"tokenizer\.json is not a tokenizer of the library"):
+        FASTActionTokenizer.from_pretrained(tmp_path, 4)
+
+
+def test_no_token_is_the_middle_and_other_things_are_no_tokens():
+    codec = FASTActionTokenizer(4, size=60)
+    assert torch.equal(codec.decode(torch.zeros(2, 0, dtype=torch.int64)), torch.zeros(2, 4, 7))
+    for tokens in (torch.zeros(2, 3), torch.tensor(1)):
+        with pytest.raises(ValueError, match="tokens must be whole numbers"):
+            codec.decode(tokens)
+
+
 def test_another_kind_of_tokenizer_is_refused(tmp_path):
     saved(tmp_path)
     Tokenizer(models.WordLevel({"<unk>": 0}, unk_token="<unk>")).save(str(tmp_path / "tokenizer.json"))

@@ -55,8 +55,9 @@ def test_waves_that_are_not_recorded_begin_in_explored_episodes(run, collectors)
 def test_what_cannot_be_branched_is_refused_before_any_work(tiny):
     for change, message in (
         ({"branch_share": 1.5}, "post_train.branch_share must lie between 0 and 1, got 1.5"),
-        ({"branch_share": 0.5, "branch_until": 16}, "branch_until must be at least 8, chunk_length, and below 16"),
-        ({"branch_share": 0.5, "branch_until": 4}, "branch_until must be at least 8, chunk_length, and below 16"),
+        ({"branch_share": 0.5, "branch_until": 16}, "branch_until, .* at least 8, chunk_length, and below 16"),
+        ({"branch_share": 0.5, "branch_until": 4}, "branch_until, .* at least 8, chunk_length, and below 16"),
+        ({"branch_share": 0.5, "branch_until": 8, "iterations": 2}, "post_train.iterations must be at least 3"),
     ):
         learned = dataclasses.replace(tiny.post_train, **change)
         with pytest.raises(SystemExit, match=message):

@@ -50,13 +50,15 @@ class BranchPoints:
     """
 
     def __init__(self, episodes: Episodes, chunk_length: int, *, share: float, latest: int = 40) -> None:
-        if not 0 <= share <= 1:
-            raise ValueError(f"share must lie between 0 and 1, got {share}")
-        if min(chunk_length, latest) < 1:
-            raise ValueError(f"chunk_length and latest must be at least 1, got {chunk_length} and {latest}")
+        if chunk_length < 1 or latest < chunk_length or latest != int(latest):
+            raise ValueError(
+                "chunk_length must be at least 1 and latest a whole number not below it, got "
+                f"{chunk_length} and {latest}"
+            )
         if "success" not in episodes:
             raise ValueError("the episodes carry no success labels: branch points lie before the goal is reached")
-        self.episodes, self.chunk_length, self.share, self.latest = episodes, int(chunk_length), share, int(latest)
+        self.episodes, self.chunk_length, self.latest = episodes, int(chunk_length), int(latest)
+        self.share = share
         length = episodes["length"].squeeze(-1)
         done = episodes["success"].long().cummax(1).values
         reached = torch.where(done[:, -1] > 0, done.shape[1] - done.sum(1), length)
@@ -71,6 +73,17 @@ class BranchPoints:
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    @property
+    def share(self) -> float:
+        """Of the groups that begin at a point."""
+        return self._share
+
+    @share.setter
+    def share(self, share: float) -> None:
+        if not 0 <= share <= 1:
+            raise ValueError(f"share must lie between 0 and 1, got {share}")
+        self._share = float(share)
 
     def draw(self, task: int, generator: torch.Generator) -> int | None:
         """Number of a point of an episode of ``task``; None where a group is to begin at a context, as it is where
@@ -107,12 +120,17 @@ class BranchPoints:
         return self.episodes["kinematic_states"][self.rows[points], :count]
 
     def past(self, points: Tensor) -> TensorDict:
-        """All that was shown up to ``points`` [n], which are at the same step t.
+        """All that was shown up to ``points`` [n], at least one, which are at the same step t.
 
         Returns:
             TensorDict [n]: ``("frames", entry)`` uint8 [n, t + 1, 3, H, W] by camera, ``kinematic_states``
             [n, t + 1, 20].
+
+        Raises:
+            ValueError: for points at several steps.
         """
+        if len(self.steps[points].unique()) > 1:
+            raise ValueError(f"points must be at the same step, got {self.steps[points].unique().tolist()}")
         numbers = torch.arange(int(self.steps[points[0]]) + 1)
         out = TensorDict({KINEMATIC_STATES: self.kinematic_states(points, len(numbers))}, batch_size=[len(points)])
         for camera in self.episodes.cameras:

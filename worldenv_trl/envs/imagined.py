@@ -133,9 +133,9 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
             branch_points.episodes.require("the world model", world_model.cameras, world_model.image_size)
             if branch_points.chunk_length != self.chunk_length or branch_points.latest >= self.max_steps:
                 raise ValueError(
-                    f"branch points are at every {branch_points.chunk_length} steps up to {branch_points.latest}, "
-                    f"rollouts have chunks of {self.chunk_length} and end at {self.max_steps}: branch at whole chunks, "
-                    "before the end"
+                    f"branch_points has chunk_length={branch_points.chunk_length} and latest={branch_points.latest}, "
+                    f"the rollouts have chunks of {self.chunk_length} and max_steps={self.max_steps}: the chunks must "
+                    "be the same, and latest below max_steps"
                 )
         specs = imagined_specs(batch, self.cameras, self.image_size, self.chunk_length, self._instructions[0], device)
         self.observation_spec, self.state_spec, self.action_spec, self.reward_spec, self.done_spec = specs

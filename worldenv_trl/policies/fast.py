@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -17,6 +16,7 @@ from torch.nn.functional import pad
 from worldenv_trl.policies.fast_tokens import SCALE, FASTActionTokenizer
 from worldenv_trl.policies.flow_prompts import state_digits
 from worldenv_trl.policies.hf_backbone import autocast
+from worldenv_trl.policies.hf_files import read_json, tokenizer_of
 from worldenv_trl.policies.language_tokens import LanguageTokenPolicy
 from worldenv_trl.policies.vision_language import TOKENIZER_NAME, VisionLanguageConfig
 from worldenv_trl.row_share import own_rows
@@ -245,14 +245,13 @@ class FASTPolicy(LanguageTokenPolicy):
 
     @classmethod
     def build(cls, config: FASTConfig, folder: Path) -> Self:
-        from tokenizers import Tokenizer
         from transformers.initialization import no_init_weights
 
-        described = json.loads((folder / CODEC_NAME).read_text())
-        bpe = Tokenizer.from_file(str(folder / VOCABULARY_NAME))
-        codec = FASTActionTokenizer.read(described, bpe, config.horizon, folder, config.max_tokens)
+        described, bpe = read_json(folder, CODEC_NAME), tokenizer_of(folder / VOCABULARY_NAME)
+        codec = FASTActionTokenizer.read(described, bpe, config.horizon, folder / CODEC_NAME, config.max_tokens)
+        tokenizer = tokenizer_of(folder / TOKENIZER_NAME)
         with no_init_weights():  # billions of random numbers take minutes
-            return cls(config, Tokenizer.from_file(str(folder / TOKENIZER_NAME)), action_tokenizer=codec)
+            return cls(config, tokenizer, action_tokenizer=codec)
 
     def _logits(self, hidden: Tensor) -> Tensor:
         logits, known = super()._logits(hidden), self.action_tokenizer.known

@@ -165,19 +165,21 @@ class FASTActionTokenizer(ActionTokenizerBase):
         return tokens.reshape(*actions.shape[:-2], self.max_tokens).to(actions.device)
 
     def decode(self, tokens: Tensor) -> Tensor:
-        """Chunks float32 [..., H, 7] of tokens [..., any number of them], on their device.
+        """Chunks float32 [..., H, 7] of tokens int64 [..., any number of them], on their device.
 
         What is drawn may stand for none. Coefficients that are missing at the end, the high frequencies, are zeros,
         those that are too many are left out, and no token at all is the chunk that is ``center`` throughout: the
         remedies of openpi and LeRobot.
 
         Raises:
-            ValueError: for a token outside the vocabulary.
+            ValueError: for a token outside the vocabulary, or tokens that are not whole numbers [..., n].
         """
+        if tokens.ndim < 1 or tokens.is_floating_point():
+            raise ValueError(f"tokens must be whole numbers [..., n], got {tokens.dtype} {list(tokens.shape)}")
         shape = (*tokens.shape[:-1], self.horizon, ACTION_DIM)
         if tokens.is_meta:  # an outline has no numbers, only as many of them
             return torch.zeros(shape, device="meta")
-        rows = tokens.reshape(-1, tokens.shape[-1]).tolist()
+        rows = tokens.reshape(math.prod(shape[:-2]), tokens.shape[-1]).tolist()
         wrong = [token for row in rows for token in row if not 0 <= token <= self.end]
         if wrong:
             raise ValueError(f"tokens must lie between 0 and {self.end}, the end, got {wrong[0]}")
@@ -226,7 +228,7 @@ class FASTActionTokenizer(ActionTokenizerBase):
 
         Args:
             folder: with ``tokenizer.json`` and ``processor_config.json``.
-            horizon: actions of a chunk; the folder's own, where it tells one.
+            horizon: actions of a chunk; where the folder tells one, it must be the same.
 
         Keyword Args:
             max_tokens: of a sequence, see the class.
@@ -236,13 +238,14 @@ class FASTActionTokenizer(ActionTokenizerBase):
             ValueError: if it was made for other chunks, or one of its files is not FAST's.
         """
         folder = local_folder(folder)
-        return cls.read(read_json(folder, PROCESSOR_NAME), read_tokenizer(folder), horizon, folder, max_tokens)
+        described, path = read_json(folder, PROCESSOR_NAME), folder / PROCESSOR_NAME
+        return cls.read(described, read_tokenizer(folder), horizon, path, max_tokens)
 
     @classmethod
-    def read(cls, described: dict[str, Any], bpe: Tokenizer, horizon: int, folder: Path, max_tokens: int = 0) -> Self:
-        """Of the two files' contents; see :meth:`from_pretrained`."""
-        path = folder / PROCESSOR_NAME
-        missing = [name for name in ("scale", "min_token") if not isinstance(described.get(name), int | float)]
+    def read(cls, described: dict[str, Any], bpe: Tokenizer, horizon: int, path: Path, max_tokens: int = 0) -> Self:
+        """Of the two files' contents, the first one's ``path`` being named in errors; see :meth:`from_pretrained`."""
+        numbers = {name: described.get(name) for name in ("scale", "min_token")}
+        missing = [name for name, value in numbers.items() if not isinstance(value, int | float) or value != value]
         if missing:
             raise ValueError(f"{path} has no number {' and '.join(missing)}: this is no tokenizer of FAST")
         for name, wanted in (("time_horizon", horizon), ("action_dim", ACTION_DIM)):
@@ -251,11 +254,14 @@ class FASTActionTokenizer(ActionTokenizerBase):
                     f"{path}: {name} is {described[name]}, the policy's chunks have {wanted}: take a tokenizer for "
                     f"these, or train one (FASTActionTokenizer.fit)"
                 )
-        codec = cls(horizon, size=max(bpe.get_vocab_size(), described.get("vocab_size") or 0), max_tokens=max_tokens)
+        size = described.get("vocab_size") or 0
+        if not isinstance(size, int):
+            raise ValueError(f"{path}: vocab_size must be a whole number, got {size!r}")
+        codec = cls(horizon, size=max(bpe.get_vocab_size(), size), max_tokens=max_tokens)
         try:
             codec.set_vocabulary(bpe, described["scale"], described["min_token"])
         except ValueError as error:
-            raise ValueError(f"{folder}: {error}") from error
+            raise ValueError(f"{path.parent}: {error}") from error
         return codec
 
     def _rounded(self, actions: Tensor, scale: float) -> np.ndarray:

@@ -114,16 +114,29 @@ def read_tokenizer(folder: Path) -> Tokenizer:
 
     Raises:
         FileNotFoundError: if it is missing; how to make it from older files is said.
+        ValueError: if it is none.
     """
-    from tokenizers import Tokenizer
-
     path = folder / "tokenizer.json"
     if not path.is_file():
         raise FileNotFoundError(
             f"{path} is missing: write it with transformers' "
             f"AutoTokenizer.from_pretrained({str(folder)!r}).save_pretrained({str(folder)!r})"
         )
-    return Tokenizer.from_file(str(path))
+    return tokenizer_of(path)
+
+
+def tokenizer_of(path: Path) -> Tokenizer:
+    """Of a file of the library ``tokenizers``.
+
+    Raises:
+        ValueError: naming the file, if it holds something else.
+    """
+    from tokenizers import Tokenizer
+
+    try:
+        return Tokenizer.from_file(str(path))
+    except Exception as error:  # the library raises nothing more special
+        raise ValueError(f"{path} is not a tokenizer of the library tokenizers: {error}") from error
 
 
 def check_weights(folder: Path, pattern: str = "*.safetensors") -> list[Path]:

@@ -134,8 +134,9 @@ def test_a_rollout_that_branched_from_an_episode_is_refused(tmp_path):
     wave = next(iter(GroupCollector(env, closing(4), groups_per_batch=2)))
     with RolloutWriter(tmp_path / "a.mcap", **provenance(env, models={"world_model": Painter()}, tasks=[TASK])) as file:
         file.write(wave)
-    with pytest.raises(ValueError, match=r"rollout 1 of .* branched from step 4 of a recorded episode"):
-        replay(tmp_path / "a.mcap", 1, world_model=Painter())
+    for options in ({"world_model": Painter()}, {"mode": "physics"}, {"world_model": Painter(), "from_step": 99}):
+        with pytest.raises(ValueError, match=r"rollout 1 of .* branched from step 4 of a recorded episode"):
+            replay(tmp_path / "a.mcap", 1, **options)
 
 
 def test_every_camera_of_the_model_is_replayed_and_compared(tmp_path):

@@ -100,6 +100,12 @@ def replay(
         (True, 'what-if', 4)
     """
     source = open_rollout(path, rollout)
+    begun = source.entries[0].get(NUM_STEPS, None)
+    if source.imagined and begun is not None and int(begun):
+        raise ValueError(
+            f"rollout {source.number} of {source.path} branched from step {int(begun)} of a recorded episode, whose "
+            "frames it does not hold: it cannot be lived again. Record waves whose branch_points have share 0"
+        )
     mode = mode or ("imagination" if source.imagined else "physics")
     branch = _branch(source, mode, world_model, reflector, from_step, policy, seed, threshold, edits or {})
     kind = "what-if" if branch else "exact"
@@ -205,12 +211,6 @@ def _imagined(
     world_model = options["world_model"]
     length = world_model.chunk_length
     rollouts = chunks_of(source, length, world_model.cameras)
-    begun = rollouts[0, 0].get(NUM_STEPS, None)
-    if source.imagined and begun is not None and int(begun):
-        raise ValueError(
-            f"rollout {source.number} of {source.path} branched from step {int(begun)} of a recorded episode, whose "
-            "frames it does not hold: it cannot be imagined again. Record waves whose branch_points have share 0"
-        )
     known = source.env.get("max_steps", source.steps) if source.imagined else source.steps
     options["max_steps"] = max(known) if isinstance(known, list) else max(int(known), source.steps)
     options["proprio"] = source.env.get("proprio", "commanded")
