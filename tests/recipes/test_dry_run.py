@@ -45,6 +45,12 @@ def test_bad_options_and_settings_are_one_line(options, message, capsys):
     assert capsys.readouterr().out.splitlines()[-1] == f"error: {message}"
 
 
+def test_a_ratio_that_the_policy_does_not_have_is_refused_as_in_the_run(tiny):
+    learned = dataclasses.replace(tiny.post_train, ratio_level="token")
+    (problem,) = rehearse(dataclasses.replace(tiny, post_train=learned), COMPACT).problems
+    assert problem.startswith("policy: post_train.ratio_level must be step or chunk for OFTPolicy")
+
+
 def test_costs_of_the_compact_policy_are_what_torch_counts(tiny):
     found = rehearse(tiny, COMPACT)
     assert not found.problems and set(found.calls) == {
