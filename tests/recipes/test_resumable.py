@@ -253,10 +253,8 @@ def test_a_process_killed_again_and_again_ends_bit_for_bit_where_a_straight_one_
         if process.is_alive():
             process.kill()
             process.join()
-            assert process.exitcode == -signal.SIGKILL
-            kills += 1
-        else:
-            assert process.exitcode == 0
+        assert process.exitcode in (0, -signal.SIGKILL)  # it may have ended just before the signal
+        kills += process.exitcode == -signal.SIGKILL
     assert kills
     run = open_run(tmp_path / "run")
     assert torch.equal(torch.from_numpy(np.load(run.folder.path / "weights.npy")), straight[0])
