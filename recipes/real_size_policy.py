@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -164,30 +165,24 @@ def row(name: str, backbone: PretrainedConfig | PrismaticConfig) -> Row:
     )
 
 
+def token_row(name: str, make: Callable[[], TokenPolicy]) -> Row:
+    return Row(
+        name=f"policy-{name}",
+        unit="decision",
+        make=make,
+        inputs=inputs,
+        call=decide,
+        train=learning,
+        loss=cross_entropy,
+        compile=compile_layers,
+        read_again=read_by_later_tokens,
+    )
+
+
 ROWS = (
     row("openvla-oft-7b", openvla_oft_7b()),
-    Row(
-        name="policy-openvla-7b-tokens",
-        unit="decision",
-        make=make_tokens,
-        inputs=inputs,
-        call=decide,
-        train=learning,
-        loss=cross_entropy,
-        compile=compile_layers,
-        read_again=read_by_later_tokens,
-    ),
-    Row(
-        name="policy-pi0-fast-3b",
-        unit="decision",
-        make=make_whole_chunks,
-        inputs=inputs,
-        call=decide,
-        train=learning,
-        loss=cross_entropy,
-        compile=compile_layers,
-        read_again=read_by_later_tokens,
-    ),
+    token_row("openvla-7b-tokens", make_tokens),
+    token_row("pi0-fast-3b", make_whole_chunks),
     row("llava-7b", llava_7b()),
     row("paligemma-3b", paligemma_3b()),
     row("smolvlm-500m", smolvlm_500m()),
