@@ -70,6 +70,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         ("post_train.ratio_level", config.post_train.ratio_level, ("step", "chunk", "token")),
         ("parallel", config.parallel, MODES),
         ("demonstrate.actions", config.demonstrate.actions, ACTIONS),
+        ("demonstrate.states", config.demonstrate.states, ("first", "spread")),
     ):
         if value not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
@@ -103,6 +104,12 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     for name, count in counts:
         if count < 1:
             raise ValueError(f"{name} must be at least 1, got {count}")
+    wanted = config.demonstrate.episodes_per_task
+    if config.demonstrate.states == "spread" and wanted > config.train_states:
+        raise ValueError(
+            f"demonstrate.episodes_per_task must be at most {config.train_states}, train_states, where the states are "
+            f"spread, got {wanted}"
+        )
     if config.seed < 0:
         raise ValueError(f"seed must be a whole number of at least 0, got {config.seed}")
     if config.reflector.path_steps < 0:

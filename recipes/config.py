@@ -33,7 +33,10 @@ class Demonstrate:
     """Scripted-expert demonstrations, or LIBERO's where ``tasks`` names its files: the only supervised data."""
 
     episodes_per_task: int = 5
-    """Demonstrations per task: the expert's from the first training initial states, LIBERO's first successful ones."""
+    """Demonstrations per task: the expert's from ``states``, LIBERO's first successful ones."""
+    states: str = "first"
+    """Training initial states that the expert starts from: the ``first``, which are drawn at random, or those that are
+    ``spread``: all others lie as near to one of them as can be."""
     actions: str = "path"
     """Of LIBERO's demonstrations: ``path``, what moves the hand along their path here, or ``stored``, the commands for
     LIBERO's controller, which forward kinematics does not follow: then SFT is the last stage."""

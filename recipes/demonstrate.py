@@ -1,4 +1,4 @@
-"""Scripted-expert demonstrations from the first training initial states, or those of LIBERO's files.
+"""Scripted-expert demonstrations from some training initial states, or those of LIBERO's files.
 
 Alone: ``python recipes/demonstrate.py improve --run-dir runs/improve``.
 """
@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from config import WorldEnvConfig
 from libero_files import convert, from_libero
 from physics import recording, tabletop
 from resumable import Outside, Resumable
@@ -17,7 +18,8 @@ from run import Run
 from stages import run_alone
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
-from worldenv_trl.envs import ExpertPolicy
+from worldenv_trl.envs import ExpertPolicy, context_id
+from worldenv_trl.scenes import goal_places, load_task, spread_states
 
 
 def demonstrate(run: Run) -> None:
@@ -40,7 +42,7 @@ def demonstrate(run: Run) -> None:
         left = Resumable(run, "tasks", len(config.tasks), recording=Outside(recorded))
         for number in left.bar("demonstrate", "task"):
             task = config.tasks[number]
-            env = tabletop(config, "train", count, [task], **options)
+            env = tabletop(config, "train", count, [task], **options | _starts(config, number))
             collector = GroupCollector(
                 env,
                 ExpertPolicy(env),
@@ -57,6 +59,16 @@ def demonstrate(run: Run) -> None:
             folder.log(
                 "demonstrate", task=task, episodes=count, steps=rollouts[keys.MASK].sum(-1).float().mean().item()
             )
+
+
+def _starts(config: WorldEnvConfig, number: int) -> dict[str, Any]:
+    """Of the demonstrations of a task: options of its env."""
+    if config.demonstrate.states == "first":
+        return {}
+    task = load_task(config.tasks[number])
+    states = task.init_states("train", config.train_states)
+    rows = spread_states(goal_places(task, states), config.demonstrate.episodes_per_task)
+    return {"init_states": states[rows], "context_ids": [context_id(number, "train", row) for row in rows]}
 
 
 def check_solved(task: str, solved: torch.Tensor) -> None:

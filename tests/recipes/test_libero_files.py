@@ -98,6 +98,7 @@ def test_the_same_settings_convert_to_the_same_bits(settings, tmp_path):
         ({"cameras": ("agentview", "front")}, "--cameras agentview wrist"),
         ({"max_steps": 8}, "a demonstration of 12 steps, max_steps is 8: --max-steps 16 or more"),
         ({"demonstrate": config.Demonstrate(3)}, r"holds 2 demonstrations.*--demonstrate.episodes-per-task 2"),
+        ({"demonstrate": config.Demonstrate(2, states="spread")}, "LIBERO's files bring their own demonstrations"),
         ({"demonstrate": config.Demonstrate(2, actions="delta")}, "must be one of path, stored, got 'delta'"),
     ],
 )

@@ -55,6 +55,8 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ),
         ({"train_states": 0}, "train_states must be at least 1, got 0"),
         ({"num_threads": 0}, "num_threads must be at least 1"),
+        ({"demonstrate": Demonstrate(states="far")}, "demonstrate.states must be one of first, spread, got 'far'"),
+        ({"demonstrate": Demonstrate(51, states="spread")}, "demonstrate.episodes_per_task must be at most 50, train_"),
         ({"demonstrate": Demonstrate(episodes_per_task=0)}, "demonstrate.episodes_per_task must be at least 1"),
         ({"explore": Explore(scale_factors=())}, "explore.scale_factors"),
         (
