@@ -1,6 +1,7 @@
 """How brittle five demonstrations a task leave a policy: SFT on a suite, greedy success on held-out initial states.
 
-``python recipes/benchmarks/sft.py --suite spatial --run-dir runs/sft_spatial`` (one policy for the suite's ten tasks)
+``python recipes/benchmarks/sft.py --suite spatial --run-dir runs/sft_spatial`` (one policy for the suite's ten tasks);
+with pretrained eyes and chosen demonstrations ``--sft.vision-blocks 2 4 10 --demonstrate.states spread``.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from checks import check_config
 from command_line import at_least, refusals
-from config import SFT, WorldEnvConfig
+from config import SFT, Demonstrate, WorldEnvConfig
 from demonstrate import demonstrate
 from outcomes import physics_outcomes
 from run import Run
@@ -40,6 +41,9 @@ class Settings:
     num_threads: int = 2
     device: str = "auto"
     """Of the policy: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, CUDA where there is one."""
+    train_states: int = 50
+    """Of each task, among which the demonstrations' are."""
+    demonstrate: Demonstrate = field(default_factory=Demonstrate)
     sft: SFT = field(default_factory=lambda: SFT(steps=3000))
 
 
@@ -55,6 +59,8 @@ def main(settings: Settings) -> None:
         device=settings.device,
         tasks=tasks,
         max_steps=steps,
+        train_states=settings.train_states,
+        demonstrate=settings.demonstrate,
         sft=settings.sft,
     )
     with refusals():
