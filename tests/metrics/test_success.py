@@ -31,6 +31,8 @@ def test_the_interval_solves_the_score_equation():
 def test_certain_outcomes_keep_their_bound():
     assert wilson_interval(0, 50)[0] == 0
     assert wilson_interval(50, 50)[1] == 1
+    for n in range(1, 400):  # rounding must not take the rate out of its own interval: 60 of 60 ended below 1
+        assert wilson_interval(0, n)[0] == 0 and wilson_interval(n, n)[1] == 1
 
 
 @pytest.mark.parametrize(("successes", "n", "confidence"), [(1, 0, 0.95), (-1, 5, 0.95), (6, 5, 0.95), (1, 5, 1.0)])

@@ -51,6 +51,14 @@ def test_plots_are_drawn_for_what_was_measured(run_dir):
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in written)
 
 
+def test_a_success_that_lies_beside_its_rounded_interval_is_drawn(run_dir):
+    line = {"stage": "evaluate", "protocol": "physics", "policy": "sft", "task": "goal/open_the_top_drawer"}
+    with (run_dir / "metrics.jsonl").open("a") as file:
+        for success, low, high in ((1.0, 0.94, 1 - 1e-16), (0.0, 1e-17, 0.06)):
+            file.write(json.dumps(line | {"success": success, "low": low, "high": high, "episodes": 60}) + "\n")
+    assert "evaluation.png" in {path.name for path in plot_run(run_dir)}
+
+
 def test_a_folder_without_metrics_is_named_in_the_error(tmp_path):
     with pytest.raises(FileNotFoundError, match="not a run folder"):
         summary_table(tmp_path)

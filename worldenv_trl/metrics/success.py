@@ -30,7 +30,7 @@ def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> tuple[f
     rate = successes / n
     center = (rate + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
-    return max(0.0, center - half), min(1.0, center + half)
+    return min(rate, max(0.0, center - half)), max(rate, min(1.0, center + half))  # it holds the rate, rounded or not
 
 
 def paired_test(before: Tensor, after: Tensor) -> dict[str, float]:

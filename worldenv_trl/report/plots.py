@@ -100,8 +100,8 @@ def _evaluation(lines: list[dict[str, Any]]) -> Any:
             rows = [line for line in measured if line["policy"] == policy]
             heights = [row["success"] for row in rows]
             spans = [
-                [h - row["low"] for h, row in zip(heights, rows, strict=True)],
-                [row["high"] - h for h, row in zip(heights, rows, strict=True)],
+                [max(0.0, h - row["low"]) for h, row in zip(heights, rows, strict=True)],  # bounds are rounded
+                [max(0.0, row["high"] - h) for h, row in zip(heights, rows, strict=True)],
             ]
             axes.bar([i + 0.4 * offset for i in range(len(rows))], heights, 0.38, yerr=spans, capsize=3, label=policy)
         axes.set_xticks(
