@@ -17,9 +17,8 @@ if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
 
 torch.set_num_threads(1)  # test processes share the cores
 
-if (
-    signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-):  # as in the background of a script; what tests start would inherit it
+# Ignored in the background of a script; what the tests start, and interrupt, would inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

@@ -43,8 +43,8 @@ class Settings:
 def main(settings: Settings) -> None:
     with refusals():
         at_least(1, parts=settings.parts)
-        if not settings.runs:
-            raise ValueError("name one run folder or more")
+        if not settings.runs or not settings.policies:
+            raise ValueError("name one run folder and one of --policies at least")
         found = [read_run(path, settings.policies) for path in settings.runs]
         tasks = list(found[0].distances)
         for path, one in zip(settings.runs[1:], found[1:], strict=True):
@@ -71,36 +71,43 @@ class Covered:
 
 
 def read_run(path: Path, policies: tuple[str, ...]) -> Covered:
-    """Raises ``FileNotFoundError`` for a stage that has not run, ``ValueError`` for demonstrations without a state."""
+    """Reads what ``demonstrate`` and ``evaluate`` have recorded.
+
+    Raises:
+        FileNotFoundError: naming a stage that has not run.
+        ValueError: for demonstrations without a numbered state, or policies that were evaluated on different states.
+    """
     config, folder = read_config(RunRecord.read(path), 1), RunFolder(path)
-    shown = _by_context(folder.require_rollouts("demonstrations", "demonstrate"))
+    shown = _outcomes(folder.require_rollouts("demonstrations", "demonstrate"))
     if UNKNOWN_CONTEXT in shown:
         raise ValueError(f"{path}: its demonstrations do not say which initial states they begin at")
-    distances, success = dict[str, np.ndarray](), dict[tuple[str, str], np.ndarray]()
     evaluated = {
-        policy: _by_context(folder.require_rollouts(f"evaluate_physics_{policy}", "evaluate")) for policy in policies
+        policy: _outcomes(folder.require_rollouts(f"evaluate_physics_{policy}", "evaluate")) for policy in policies
     }
+    if len({tuple(outcomes) for outcomes in evaluated.values()}) > 1:
+        raise ValueError(f"{path}: {', '.join(policies)} were not evaluated on the same states")
+    distances, success = dict[str, np.ndarray](), dict[tuple[str, str], np.ndarray]()
     for number, name in enumerate(config.tasks):
         task = load_task(name)
         trained = goal_places(task, task.init_states("train", config.train_states))
-        demonstrated = trained[_indices(shown, number)]
         for policy, outcomes in evaluated.items():
-            rows = _indices(outcomes, number)
-            success[policy, name] = np.array([each for at, each in outcomes.items() if parts_of(at)[0] == number])
-            held_out = goal_places(task, task.init_states("test", 1 + max(rows))[rows])
-            distances[name] = layout_distances(held_out, demonstrated, trained).min(1)
+            success[policy, name] = np.array([*_of_task(outcomes, number).values()])
+        rows = list(_of_task(evaluated[policies[0]], number))
+        held_out = goal_places(task, task.init_states("test", 1 + max(rows))[rows])
+        distances[name] = layout_distances(held_out, trained[list(_of_task(shown, number))], trained).min(1)
     return Covered(distances, success)
 
 
-def _by_context(path: Path) -> dict[int, bool]:
+def _outcomes(path: Path) -> dict[int, bool]:
     """Whether the episode from each initial state reached the goal, in the order of their numbers."""
     rollouts = read_rollouts(path, keys=[keys.CONTEXT_ID, ("next", keys.SUCCESS), keys.MASK])
     reached = (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1).flatten().tolist()
     return dict(sorted(zip(rollouts[keys.CONTEXT_ID][..., 0, 0].flatten().tolist(), reached, strict=True)))
 
 
-def _indices(outcomes: dict[int, bool], task: int) -> list[int]:
-    return [parts_of(number)[2] for number in outcomes if parts_of(number)[0] == task]
+def _of_task(outcomes: dict[int, bool], task: int) -> dict[int, bool]:
+    """Those of one task, by the index of the state in its split."""
+    return {parts_of(number)[2]: each for number, each in outcomes.items() if parts_of(number)[0] == task}
 
 
 def _rate(success: np.ndarray) -> str:

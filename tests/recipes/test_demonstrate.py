@@ -77,6 +77,20 @@ def test_success_by_distance_from_the_demonstrations(tmp_path, capsys):
         coverage.main(coverage.Settings((run.folder.path,)))
 
 
+def test_policies_on_different_states_are_not_compared(tmp_path):
+    run = demonstrated(tmp_path / "run", "first")
+    policy = run.parts.policy.make(run.config)
+    for name, episodes in (("sft", 4), ("post_train", 2)):
+        policy.save_pretrained(run.folder.checkpoint(name))
+        fewer = dataclasses.replace(run.config, evaluate=config.Evaluate(episodes_per_task=episodes, num_envs=2))
+        rolled(Run(fewer, run.folder), "physics", name, None)
+    coverage = benchmark("coverage")
+    with pytest.raises(SystemExit, match="sft, post_train were not evaluated on the same states"):
+        coverage.main(coverage.Settings((run.folder.path,)))
+    with pytest.raises(SystemExit, match="one of --policies at least"):
+        coverage.main(coverage.Settings((run.folder.path,), policies=()))
+
+
 def test_runs_with_other_demonstrations_are_not_taken_together(tmp_path):
     runs = [demonstrated(tmp_path / states, states) for states in ("first", "spread")]
     for run in runs:

@@ -99,8 +99,8 @@ def _evaluation(lines: list[dict[str, Any]]) -> Any:
         for offset, policy in enumerate(dict.fromkeys(line["policy"] for line in measured)):
             rows = [line for line in measured if line["policy"] == policy]
             heights = [row["success"] for row in rows]
-            spans = [
-                [max(0.0, h - row["low"]) for h, row in zip(heights, rows, strict=True)],  # bounds are rounded
+            spans = [  # in older metrics a bound may lie a rounding on the wrong side
+                [max(0.0, h - row["low"]) for h, row in zip(heights, rows, strict=True)],
                 [max(0.0, row["high"] - h) for h, row in zip(heights, rows, strict=True)],
             ]
             axes.bar([i + 0.4 * offset for i in range(len(rows))], heights, 0.38, yerr=spans, capsize=3, label=policy)
