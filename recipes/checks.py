@@ -5,7 +5,7 @@ from __future__ import annotations
 from collecting import check_collectors
 from config import WorldEnvConfig
 from data_parallel import MODES
-from libero_files import check_files
+from libero_files import check_files, from_libero
 from loggers import check_loggers
 from parts import COMPACT, Parts
 from physics import tabletop
@@ -105,7 +105,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         if count < 1:
             raise ValueError(f"{name} must be at least 1, got {count}")
     wanted = config.demonstrate.episodes_per_task
-    if config.demonstrate.states == "spread" and wanted > config.train_states:
+    if config.demonstrate.states == "spread" and wanted > config.train_states and not from_libero(config):
         raise ValueError(
             f"demonstrate.episodes_per_task must be at most {config.train_states}, train_states, where the states are "
             f"spread, got {wanted}"
@@ -134,6 +134,8 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         ("reflector.imagined_share", config.reflector.imagined_share),
         ("reflector.holdout", config.reflector.holdout),
         ("post_train.branch_share", config.post_train.branch_share),
+        ("post_train.averaging", config.post_train.averaging),
+        ("post_train.source_share", config.post_train.source_share),
     ):
         if share is not None and not 0 <= share <= 1:
             raise ValueError(f"{name} must lie between 0 and 1, got {share}")

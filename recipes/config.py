@@ -36,7 +36,7 @@ class Demonstrate:
     """Demonstrations per task: the expert's from ``states``, LIBERO's first successful ones."""
     states: str = "first"
     """Training initial states that the expert starts from: the ``first``, which are drawn at random, or those that are
-    ``spread``: all others lie as near to one of them as can be."""
+    ``spread``: all others lie as near to one of them as can be. Of the expert's; not read for LIBERO's."""
     actions: str = "path"
     """Of LIBERO's demonstrations: ``path``, what moves the hand along their path here, or ``stored``, the commands for
     LIBERO's controller, which forward kinematics does not follow: then SFT is the last stage."""
@@ -152,6 +152,9 @@ class PostTrain:
     head_lr: float = 2e-4
     averaging: float = 0.8
     """Decay per iteration of the running mean of the weights that is saved."""
+    source_share: float = 0.0
+    """Share in what is saved of the weights that LOOP began with; the running mean has the rest. A half keeps the
+    gains of LOOP in imagination and gives back most of what it breaks."""
     scale_factor: float = 1.0
     """Behaviour and scored density use this multiple of the policy's scale, or of its temperature if it acts by tokens.
     """

@@ -56,11 +56,6 @@ def check_files(config: WorldEnvConfig) -> None:
     other = [task for task in config.tasks if not task.endswith(SUFFIXES)]
     if other:
         raise ValueError(f"tasks must be LIBERO's files, all or none: {other[0]} is none")
-    if config.demonstrate.states != "first":
-        raise ValueError(
-            f"demonstrate.states={config.demonstrate.states!r} says where the expert begins, and LIBERO's files bring "
-            "their own demonstrations: leave it out"
-        )
     for path, found, count in _inspected(config):
         missing = [camera for camera in config.cameras if camera not in found.cameras]
         if missing:

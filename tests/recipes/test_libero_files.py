@@ -91,6 +91,13 @@ def test_the_same_settings_convert_to_the_same_bits(settings, tmp_path):
         assert torch.equal(made[0][key], made[1][key])
 
 
+def test_where_the_expert_would_begin_is_not_read(settings):
+    spread = config.Demonstrate(2, states="spread")
+    run = open_run(dataclasses.replace(settings, demonstrate=spread, train_states=1))
+    rerun("demonstrate", world_env.demonstrate, run)
+    assert len(read_rollouts(run.folder.rollouts("demonstrations"))) == 2 * len(run.config.tasks)
+
+
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
@@ -98,7 +105,6 @@ def test_the_same_settings_convert_to_the_same_bits(settings, tmp_path):
         ({"cameras": ("agentview", "front")}, "--cameras agentview wrist"),
         ({"max_steps": 8}, "a demonstration of 12 steps, max_steps is 8: --max-steps 16 or more"),
         ({"demonstrate": config.Demonstrate(3)}, r"holds 2 demonstrations.*--demonstrate.episodes-per-task 2"),
-        ({"demonstrate": config.Demonstrate(2, states="spread")}, "LIBERO's files bring their own demonstrations"),
         ({"demonstrate": config.Demonstrate(2, actions="delta")}, "must be one of path, stored, got 'delta'"),
     ],
 )

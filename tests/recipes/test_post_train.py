@@ -93,6 +93,38 @@ def test_uniform_contexts_come_in_shuffled_passes(physics):
     assert all("contexts_seen" not in line for line in physics.folder.read_metrics("post_train"))
 
 
+def saved(run, share, returns_of):
+    """Weights that LOOP saves of the whole policy, this share its source's, and those that ``watch`` saw at the end."""
+    settings = dataclasses.replace(run.config.post_train, source_share=share, lora_rank=0)
+    run = dataclasses.replace(run, config=dataclasses.replace(run.config, post_train=settings))
+    seen = []
+    name = f"drawn_back_{share}"
+    post_train(
+        run,
+        "sft",
+        name,
+        "",
+        returns_of=returns_of,
+        watch=lambda _, policy: seen.append({key: value.clone() for key, value in policy.state_dict().items()}),
+    )
+    return run.policy(name).state_dict(), seen[-1]
+
+
+def test_loop_saves_and_shows_what_lies_between_its_source_and_what_it_learned(physics, monkeypatch):
+    # One name for both runs would delete the first one's weights; other names alone draw other numbers.
+    monkeypatch.setattr(Run, "seed", lambda *_: 1)
+
+    def returns_of(wave):
+        return wave[keys.CHUNK][..., :3].mean((-1, -2, -3))
+
+    source = physics.policy("sft").state_dict()
+    (whole, _), (half, shown) = (saved(physics, share, returns_of) for share in (0.0, 0.5))
+    for name, value in half.items():
+        torch.testing.assert_close(value, (source[name] + whole[name]) / 2)
+        torch.testing.assert_close(value, shown[name])
+    assert any((whole[name] - value).abs().max() > 1e-4 for name, value in source.items())
+
+
 def test_iterations_that_stop_after_their_first_update_are_counted_and_said():
     logged = [(1, 1.0), (18, 0.0), (1, 1.0), (0, 1.0), (1, 1.0), (1, 0.0)]
     counts, before = [], 0

@@ -66,6 +66,8 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"post_train": PostTrain(ratio_level="foo")}, "ratio_level must be one of step, chunk, token, got 'foo'"),
         ({"post_train": PostTrain(contexts="hard")}, "contexts must be one of uniform, mixed, got 'hard'"),
         ({"post_train": PostTrain(group_size=1)}, "group_size must be at least 2"),
+        ({"post_train": PostTrain(source_share=1.5)}, "post_train.source_share must lie between 0 and 1, got 1.5"),
+        ({"post_train": PostTrain(averaging=-0.1)}, "post_train.averaging must lie between 0 and 1, got -0.1"),
         ({"seed": -1}, "seed must be a whole number of at least 0, got -1"),
         ({"checkpoint_minutes": -1.0}, "checkpoint_minutes must be at least 0, got -1.0"),
         ({"chunk_length": 0}, "chunk_length must be at least 1, got 0"),
