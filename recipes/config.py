@@ -297,10 +297,13 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
         WorldEnvConfig(
             run_dir=Path("runs/improve"),
             train_states=150,
+            demonstrate=Demonstrate(states="spread"),
             sft=SFT(vision_blocks=(2, 4, 10)),
             explore=Explore(episodes_per_task=480),
             reflector=Reflector(choose_threshold=True, path_steps=800),
-            post_train=PostTrain(iterations=36, lora_rank=0, lora_lr=5e-5, head_lr=5e-5, branch_share=0.6),
+            post_train=PostTrain(
+                iterations=36, lora_rank=0, lora_lr=5e-5, head_lr=5e-5, branch_share=0.6, source_share=0.5
+            ),
         ),
     ),
     "real-size": (
