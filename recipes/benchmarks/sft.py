@@ -1,7 +1,8 @@
 """How brittle five demonstrations a task leave a policy: SFT on a suite, greedy success on held-out initial states.
 
 ``python recipes/benchmarks/sft.py --suite spatial --run-dir runs/sft_spatial`` (one policy for the suite's ten tasks);
-with pretrained eyes and chosen demonstrations ``--sft.vision-blocks 2 4 10 --demonstrate.states spread``.
+with pretrained eyes and chosen demonstrations ``--sft.vision-blocks 2 4 10 --demonstrate.states spread``. What is to be
+chosen by its result is measured on ``--states validation``, which no stage draws from and the evaluation does not see.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import torch
 import tyro
@@ -17,8 +19,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from checks import check_config
 from command_line import at_least, refusals
-from config import SFT, Demonstrate, WorldEnvConfig
+from config import SFT, Demonstrate, WorldEnvConfig, WorldModel
 from demonstrate import demonstrate
+from learning_curves import VALIDATION_FROM
 from outcomes import physics_outcomes
 from run import Run
 from run_folder import RunFolder
@@ -36,7 +39,11 @@ class Settings:
     run_dir: Path
     suite: str = "spatial"
     episodes_per_task: int = 20
-    """Held-out initial states of each task, the first ones."""
+    """Initial states of each task on which success is counted, the first ones."""
+    states: Literal["held-out", "validation"] = "held-out"
+    """Of these: the held-out ones, or training states from number 1,000 on."""
+    cameras: tuple[str, ...] = ("agentview",)
+    image_size: int = 64
     seed: int = 0
     num_threads: int = 2
     device: str = "auto"
@@ -58,6 +65,10 @@ def main(settings: Settings) -> None:
         num_threads=settings.num_threads,
         device=settings.device,
         tasks=tasks,
+        cameras=settings.cameras,
+        image_size=settings.image_size,
+        # Not made here, but checked: a patch that suits its grid.
+        world_model=WorldModel(patch=max(1, settings.image_size // 16)),
         max_steps=steps,
         train_states=settings.train_states,
         demonstrate=settings.demonstrate,
@@ -69,18 +80,20 @@ def main(settings: Settings) -> None:
         folder.open(config)
     use_threads(config.num_threads)
     run = Run(config, folder)
-    demonstrate(run)
-    fine_tune(run)
+    if not folder.checkpoint("sft").is_dir():  # else only counted, perhaps on other states
+        demonstrate(run)
+        fine_tune(run)
     run.seed_everything("evaluate")
     actor = policy_actor(run.policy("sft"))
     print("| task | solved |\n|---|---|")
-    everything = []
+    everything, count = [], settings.episodes_per_task
+    split, first = ("test", 0) if settings.states == "held-out" else ("train", VALIDATION_FROM)
     for task in tasks:
-        everything.append(physics_outcomes(run, actor, task, "test", settings.episodes_per_task))
+        everything.append(physics_outcomes(run, actor, task, split, count, indices=range(first, first + count)))
         print(f"| {task} | {int(everything[-1].sum())} / {len(everything[-1])} |", flush=True)
     success = torch.cat(everything)
-    low, high = wilson_interval(int(success.sum()), len(success))
-    print(f"\n{settings.suite}, seed {settings.seed}: {success.float().mean():.1%} [{low:.1%}, {high:.1%}]")
+    rate, (low, high) = success.float().mean(), wilson_interval(int(success.sum()), len(success))
+    print(f"\n{settings.suite}, {settings.states}, seed {settings.seed}: {rate:.1%} [{low:.1%}, {high:.1%}]")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from benchmark_module import benchmark
+
+from worldenv_trl.scenes import list_tasks
 
 
 @pytest.mark.parametrize(
@@ -83,3 +86,26 @@ def test_the_memory_of_a_stage_is_that_of_its_helpers_too(tmp_path):
 def test_costs_are_measured_in_a_new_folder_alone(arguments):
     with pytest.raises(SystemExit, match="new --run-dir"):
         benchmark("stage_costs").main(arguments)
+
+
+@pytest.mark.parametrize(("states", "split", "first"), [("held-out", "test", 0), ("validation", "train", 1000)])
+def test_sft_is_chosen_on_validation_states_and_reported_on_others(monkeypatch, tmp_path, capsys, states, split, first):
+    module, counted, trained = benchmark("sft"), [], []
+
+    def outcomes(run, actor, task, drawn_from, episodes, *, indices):
+        counted.append((task, drawn_from, list(indices)))
+        return torch.arange(episodes) == 0
+
+    def fine_tune(run):
+        trained.append(run.config.image_size)
+        run.parts.policy.make(run.config).save_pretrained(run.folder.checkpoint("sft"))
+
+    monkeypatch.setattr(module, "demonstrate", lambda _: None)
+    monkeypatch.setattr(module, "fine_tune", fine_tune)
+    monkeypatch.setattr(module, "physics_outcomes", outcomes)
+    settings = module.Settings(tmp_path / "run", suite="starter", episodes_per_task=4, states=states, image_size=128)
+    module.main(settings)
+    module.main(settings)  # the policy is there: counted again, not trained again
+    assert trained == [128] and counted[:3] == counted[3:]
+    assert counted[:3] == [(task, split, [*range(first, first + 4)]) for task in list_tasks("starter")]
+    assert f"starter, {states}, seed 0: 25.0% [8.9%, 53.2%]" in capsys.readouterr().out
