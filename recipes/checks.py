@@ -15,6 +15,8 @@ from worldenv_trl.policies import Policy, TokenPolicy
 from worldenv_trl.reflectors import StopRule
 from worldenv_trl.scenes import load_task
 
+_FARTHEST_SHIFT_M = 0.2
+
 
 def check_shares(config: WorldEnvConfig, processes: int) -> None:
     """Raises ``ValueError`` naming the setting that so many processes cannot share out equally."""
@@ -112,6 +114,11 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         )
     if config.seed < 0:
         raise ValueError(f"seed must be a whole number of at least 0, got {config.seed}")
+    if not 0 <= config.sft.scene_shift_m <= _FARTHEST_SHIFT_M:
+        raise ValueError(
+            f"sft.scene_shift_m must lie between 0 and {_FARTHEST_SHIFT_M} (m), got {config.sft.scene_shift_m}: moved "
+            "further, what rises above the table is shown wrongly"
+        )
     if config.reflector.path_steps < 0:
         raise ValueError(f"reflector.path_steps must be at least 0, got {config.reflector.path_steps}")
     if not 0 <= config.checkpoint_minutes < float("inf"):
@@ -129,6 +136,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             f"explore.scale_factors must be one number or more, none negative, got {config.explore.scale_factors}"
         )
     for name, share in (
+        ("sft.scene_shift_share", config.sft.scene_shift_share),
         ("world_model.failure_share", config.world_model.failure_share),
         ("world_model.holdout", config.world_model.holdout),
         ("reflector.imagined_share", config.reflector.imagined_share),

@@ -21,14 +21,17 @@ import processes
 from checks import check_ratio_level
 from data_parallel import DataParallel, WholeOptimizer
 from episodes import demonstrations
+from parts import cameras_of
 from resumable import Resumable
 from run import Run
 from stages import run_alone
 from worldenv_trl import keys
 from worldenv_trl.data import policy_samples
 from worldenv_trl.devices import device_of, to_device
+from worldenv_trl.language import instructions_of
 from worldenv_trl.policies import (
     Policy,
+    SceneShift,
     TeacherForcing,
     TokenPolicy,
     laplace_actor,
@@ -108,6 +111,12 @@ def _behaviour_cloning(
     return loss
 
 
+def _lowest(samples: TensorDictBase) -> dict[str, float]:
+    """The hand's lowest height (m) in the demonstrations of each instruction: where it takes hold of things."""
+    texts, height = instructions_of(samples), samples[keys.STATE][:, 2].tolist()
+    return {text: min(z for z, other in zip(height, texts, strict=True) if other == text) for text in set(texts)}
+
+
 def _train(
     policy: Policy,
     make_loss: Callable[[Any], BCLoss],
@@ -121,7 +130,11 @@ def _train(
 ) -> None:
     settings, learner = run.config.sft, DataParallel(policy, make_loss, run.config.parallel)
     parameters, rows = learner.trained(parameters), settings.batch_size // processes.size()
-    images = [keys.image_key(camera) for camera in settings.cameras or run.config.cameras]
+    seen = settings.cameras or run.config.cameras
+    images, shift = [keys.image_key(camera) for camera in seen], None
+    if settings.scene_shift_m:
+        cameras = {camera: views for camera, views in cameras_of(run.config).items() if camera in seen}
+        shift = SceneShift(cameras, settings.scene_shift_m, settings.scene_shift_share, _lowest(samples))
     optimizer = torch.optim.AdamW(parameters, lr=lr, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
@@ -132,6 +145,8 @@ def _train(
         with processes.sharing():
             chosen = own_rows(lambda count: torch.randint(len(samples), (count,)), rows)
             batch = to_device(samples[chosen], run.device)
+            if shift is not None:
+                batch = shift(batch)
             for image in images:
                 batch[image] = random_shift(batch[image], settings.shift_px)
         out = learner(batch)

@@ -1,0 +1,63 @@
+"""What SFT learns from: demonstrations, moved over the table where that is asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from small_run import SMALL
+
+import config
+import sft
+from demonstrate import demonstrate
+from episodes import demonstrations
+from stages import open_run
+from worldenv_trl import keys
+from worldenv_trl.data import policy_samples
+from worldenv_trl.policies import SceneShift
+from worldenv_trl.scenes import load_task
+
+TASKS = config.GOAL_TASKS[1:]
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    monkeypatch.setattr("demonstrate.check_solved", lambda *_: None)  # 16 steps are too few for the expert
+    learned = dataclasses.replace(SMALL.sft, scene_shift_m=0.05, scene_shift_share=0.5, steps=4, scale_steps=1)
+    run = open_run(dataclasses.replace(SMALL, run_dir=tmp_path / "run", tasks=TASKS, sft=learned))
+    demonstrate(run)
+    return run
+
+
+def test_scene_and_hand_are_moved_at_the_height_where_each_task_takes_hold(run, monkeypatch):
+    made, moved = [], []
+
+    class Watched(SceneShift):
+        def __init__(self, cameras, reach, share, height):
+            made.append((sorted(cameras), reach, share, height))
+            super().__init__(cameras, reach, share, height)
+
+        def __call__(self, samples):
+            out = super().__call__(samples)
+            moved.append((out[keys.STATE] - samples[keys.STATE]).abs())
+            return out
+
+    monkeypatch.setattr(sft, "SceneShift", Watched)
+    sft.fine_tune(run)
+    samples = policy_samples(demonstrations(run))
+    lowest = {}
+    for row in range(len(samples)):
+        text, z = samples[row][keys.INSTRUCTION], samples[row][keys.STATE][2].item()
+        lowest[text] = min(z, lowest.get(text, z))
+    assert set(lowest) == {load_task(task).language for task in TASKS}
+    assert made == [(["agentview"], 0.05, 0.5, lowest)] * 2  # the means' lesson, then the scale's
+    distance = torch.cat(moved)
+    assert len(moved) == 5 and distance[:, 2:].max() == 0 and 0.03 < distance[:, :2].max() <= 0.05 + 1e-6
+    assert 0.3 < (distance.amax(1) > 0).float().mean() < 0.7
+
+
+def test_without_it_nothing_is_moved(run, monkeypatch):
+    monkeypatch.setattr(sft, "SceneShift", lambda *_: pytest.fail("made"))
+    still = dataclasses.replace(run.config.sft, scene_shift_m=0.0)
+    sft.fine_tune(dataclasses.replace(run, config=dataclasses.replace(run.config, sft=still)))

@@ -1,0 +1,115 @@
+"""Demonstrations in places where none was given: the scene and the hand moved over the table together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from worldenv_trl.keys import STATE, image_key
+from worldenv_trl.kinematics.calibrations import Calibrations, check_instructions, plain_cameras
+from worldenv_trl.language import instructions_of
+from worldenv_trl.robot import Camera
+from worldenv_trl.row_share import own_rows
+
+__all__ = ["SceneShift"]
+
+_LEVEL = 0.05  # of a ray's unit depth: one that falls less meets the plane far away, or behind the camera
+
+
+class SceneShift:
+    """Moves everything over the table, the hand included, each sample by a distance of its own.
+
+    Where things stand and where the hand is change together, and what the hand has to do, which actions tell relative
+    to where it is, stays the same: an equivariance that a policy of few demonstrations does not find by itself. The
+    image is warped by the homography of a horizontal plane; what lies on it moves exactly, what rises above it
+    by a parallax that grows with the distance, so small ones are meant. The position in ``("observation", "state")``
+    moves as far. A camera that is mounted on the tool sees what it saw. (DrQ's random shift, arXiv:2004.13649, moves
+    the image and says nothing of the hand; DemoGen, arXiv:2502.16932, moves objects in point clouds.)
+
+    Args:
+        cameras: ``{camera name: {instruction: camera}}``, what each instruction's scene is seen through.
+        reach: largest distance (m) along each of the table's two axes, drawn uniformly.
+        share: of the samples that are moved, in [0, 1].
+        height: of the plane (m), for all or ``{instruction: height}``: best where the hand takes hold of things, so
+            that hand and thing are seen to meet there.
+
+    Raises:
+        ValueError: for a negative reach, a share out of range, or cameras of different instructions.
+
+    Examples:
+        >>> from tensordict import NonTensorStack, TensorDict
+        >>> from worldenv_trl.robot import look_at
+        >>> front = look_at("agentview", (0.8, 0.0, 0.6), (0.0, 0.0, 0.1), 40.0)
+        >>> shift = SceneShift({"agentview": {"do it": front}}, reach=0.03)
+        >>> images, state = torch.zeros(2, 3, 64, 64, dtype=torch.uint8), torch.zeros(2, 7)
+        >>> batch = TensorDict({"observation": {"image": images, "state": state}}, [2])
+        >>> moved = shift(batch.set("language_instruction", NonTensorStack("do it", "do it")))
+        >>> moved["observation", "image"].dtype, moved["observation", "state"][:, :2].abs().max() <= 0.03
+        (torch.uint8, tensor(True))
+    """
+
+    def __init__(
+        self,
+        cameras: Mapping[str, Mapping[str, Camera]],
+        reach: float,
+        share: float = 1.0,
+        height: float | Mapping[str, float] = 0.03,
+    ) -> None:
+        if not 0 <= reach < math.inf:
+            raise ValueError(f"reach must be at least 0 m, got {reach}")
+        if not 0 <= share <= 1:
+            raise ValueError(f"share must lie between 0 and 1, got {share}")
+        plain = plain_cameras(cameras)
+        check_instructions(plain, "SceneShift")
+        self._views = {name: Calibrations(each) for name, each in plain.items()}
+        self.reach, self.share, self.height = reach, share, height
+
+    def __call__(self, samples: TensorDictBase) -> TensorDictBase:
+        """A shallow copy of ``samples`` [B] with images of its cameras, uint8 [B, 3, H, W], and states [B, 7] moved.
+
+        Raises:
+            KeyError: if the image of a camera is missing, or an instruction's height.
+        """
+        out, state = samples.copy(), samples[STATE].clone()
+        # One call draws both, so that processes that share a batch agree on the numbers of each row.
+        drawn = own_rows(lambda rows: torch.rand(rows, 3), len(samples)).to(state.device)
+        move = (2 * drawn[:, :2] - 1) * self.reach * (drawn[:, 2:] < self.share)
+        state[:, :2] += move
+        out[STATE] = state
+        texts = instructions_of(samples)
+        heights = [self.height if isinstance(self.height, float) else self.height[text] for text in texts]
+        height = torch.tensor(heights, device=state.device)
+        for name, views in self._views.items():
+            index, images = views.indices(texts), samples[image_key(name)].clone()
+            height, move = height.to(images.device), move.to(images.device)
+            for number, camera in enumerate(views.distinct):
+                rows = (index == number).nonzero().squeeze(-1).to(images.device)
+                if len(rows) and camera.mount == "world":
+                    images[rows] = _moved(images[rows], camera, height[rows], move[rows])
+            out[image_key(name)] = images
+        return out
+
+
+def _moved(images: Tensor, camera: Camera, height: Tensor, move: Tensor) -> Tensor:
+    """Images uint8 [n, 3, H, W] of ``camera`` when what lies at ``height`` [n] (m) has moved by ``move`` [n, 2] (m)."""
+    (rows, columns), device = images.shape[-2:], images.device
+    position = torch.tensor(camera.position, dtype=torch.float32, device=device)
+    rotation = torch.tensor(camera.rotation, dtype=torch.float32, device=device)
+    focal = 0.5 * rows / math.tan(math.radians(camera.fovy) / 2)
+    side_down = torch.arange(rows, device=device) + 0.5 - rows / 2
+    side_right = torch.arange(columns, device=device) + 0.5 - columns / 2
+    down, right = torch.meshgrid(side_down, side_right, indexing="ij")
+    rays = torch.stack([right / focal, -down / focal, -torch.ones_like(down)], -1) @ rotation.T  # [H, W, 3]
+    # A pixel shows the point of the plane that it now sees, where that point was before: backward warping.
+    far = (height[:, None, None, None] - position[2]) / rays[..., 2:].clamp(max=-_LEVEL)
+    seen = position + far * rays - F.pad(move, (0, 1))[:, None, None]  # [n, H, W, 3]
+    local = (seen - position) @ rotation
+    scale = focal / -local[..., 2:]
+    grid = local[..., :2] * scale * local.new_tensor([2 / columns, -2 / rows])
+    warped = F.grid_sample(images.float(), grid, padding_mode="border", align_corners=False)
+    return warped.round().to(images.dtype)
