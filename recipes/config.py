@@ -303,7 +303,7 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
             run_dir=Path("runs/improve"),
             train_states=150,
             demonstrate=Demonstrate(states="spread"),
-            sft=SFT(vision_blocks=(2, 4, 10)),
+            sft=SFT(steps=3000, vision_blocks=(2, 4, 10)),
             explore=Explore(episodes_per_task=480),
             reflector=Reflector(choose_threshold=True, path_steps=800),
             post_train=PostTrain(
