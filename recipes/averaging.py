@@ -56,18 +56,9 @@ class RunningMean:
             result.copy_(torch.lerp(mean, source, self._share))
 
     def state_dict(self) -> dict[str, Any]:
-        """Of what learns, and the number of updates; with a share of the source, that, too."""
-        state = self._mean.state_dict()
-        if self._source is not None:
-            state |= {f"source.{name}": value for name, value in self._source.state_dict().items()}
-        return state
+        """Of what learns, and the number of updates; the source is what it was made with."""
+        return self._mean.state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        if self._source is not None:
-            prefix = "source."
-            self._source.load_state_dict(
-                {name.removeprefix(prefix): value for name, value in state_dict.items() if name.startswith(prefix)}
-            )
-            state_dict = {name: value for name, value in state_dict.items() if not name.startswith(prefix)}
         self._mean.load_state_dict(state_dict)
         self._draw_back()

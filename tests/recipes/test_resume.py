@@ -31,7 +31,14 @@ SETTINGS = dataclasses.replace(
     world_model=config.WorldModel(steps=4, batch_size=2),
     reflector=config.Reflector(encoder_steps=3, steps=3, batch_size=4),
     post_train=config.PostTrain(
-        iterations=3, groups=2, group_size=2, epochs=1, probe_every=1, probe_contexts=2, contexts="mixed"
+        iterations=3,
+        groups=2,
+        group_size=2,
+        epochs=1,
+        probe_every=1,
+        probe_contexts=2,
+        contexts="mixed",
+        source_share=0.5,
     ),
 )
 
