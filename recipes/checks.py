@@ -136,7 +136,6 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             f"explore.scale_factors must be one number or more, none negative, got {config.explore.scale_factors}"
         )
     for name, share in (
-        ("sft.scene_shift_share", config.sft.scene_shift_share),
         ("world_model.failure_share", config.world_model.failure_share),
         ("world_model.holdout", config.world_model.holdout),
         ("reflector.imagined_share", config.reflector.imagined_share),

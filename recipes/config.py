@@ -54,9 +54,7 @@ class SFT:
     """Random image shift, the augmentation that helps with five demonstrations."""
     scene_shift_m: float = 0.0
     """Largest distance by which a sample's scene and hand are moved over the table together, along each of its axes:
-    demonstrations in places where none was given. Before the shift above."""
-    scene_shift_share: float = 0.7
-    """Share of the samples that are moved so."""
+    demonstrations in places where none was given (``policies.SceneShift``). Before the shift above."""
     cameras: tuple[str, ...] = ()
     """Cameras that the policy looks through, of the run's; all of them when empty. World model and reflector may see
     more than it does."""

@@ -113,8 +113,10 @@ def _behaviour_cloning(
 
 def _lowest(samples: TensorDictBase) -> dict[str, float]:
     """The hand's lowest height (m) in the demonstrations of each instruction: where it takes hold of things."""
-    texts, height = instructions_of(samples), samples[keys.STATE][:, 2].tolist()
-    return {text: min(z for z, other in zip(height, texts, strict=True) if other == text) for text in set(texts)}
+    lowest: dict[str, float] = {}
+    for text, height in zip(instructions_of(samples), samples[keys.STATE][:, 2].tolist(), strict=True):
+        lowest[text] = min(height, lowest.get(text, height))
+    return lowest
 
 
 def _train(
@@ -134,7 +136,7 @@ def _train(
     images, shift = [keys.image_key(camera) for camera in seen], None
     if settings.scene_shift_m:
         cameras = {camera: views for camera, views in cameras_of(run.config).items() if camera in seen}
-        shift = SceneShift(cameras, settings.scene_shift_m, settings.scene_shift_share, _lowest(samples))
+        shift = SceneShift(cameras, settings.scene_shift_m, height=_lowest(samples))
     optimizer = torch.optim.AdamW(parameters, lr=lr, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))

@@ -39,7 +39,7 @@ def test_what_lies_on_the_plane_is_seen_where_the_hand_says_that_it_is():
     torch.manual_seed(0)
     cameras, points = {"agentview": {"left": FRONT, "right": SIDE}}, ((0.02, -0.03, 0.05), (0.01, 0.04, 0.15))
     images = torch.stack([blob((FRONT, SIDE)[row % 2], points[row % 2], 64) for row in range(12)])
-    moved = SceneShift(cameras, 0.06, height={"left": 0.05, "right": 0.15})(samples(images, ("left", "right")))
+    moved = SceneShift(cameras, 0.06, 1.0, height={"left": 0.05, "right": 0.15})(samples(images, ("left", "right")))
     move = moved[keys.STATE][:, :3]
     assert move[:, 2].abs().max() == 0 and move[:, :2].abs().max() <= 0.06 and move[:, :2].std(0).min() > 0.02
     for row, image in enumerate(moved[keys.IMAGE]):
@@ -72,7 +72,7 @@ def test_mujoco_draws_it_so_when_its_camera_moves_the_other_way():
 
         torch.manual_seed(1)
         plain = drawn(np.zeros(3))
-        moved = SceneShift({"agentview": {"left": FRONT}}, 0.05)(samples(plain[None].repeat(6, 1, 1, 1)))
+        moved = SceneShift({"agentview": {"left": FRONT}}, 0.05, 1.0)(samples(plain[None].repeat(6, 1, 1, 1)))
         for image, (x, y) in zip(moved[keys.IMAGE], moved[keys.STATE][:, :2].tolist(), strict=True):
             expected = drawn(np.array([x, y, 0.0]))[:, 40:-12, 12:-12].float()  # the border repeats its edge
             before, after = ((each[:, 40:-12, 12:-12] - expected).square().mean() for each in (plain, image))
@@ -101,7 +101,7 @@ def test_nothing_else_changes_and_what_is_not_moved_keeps_its_bits():
 def test_a_camera_on_the_tool_sees_what_it_saw():
     images = torch.randint(0, 256, (4, 3, 32, 32), dtype=torch.uint8)
     given = samples(images, more={keys.WRIST_IMAGE: images.clone()})
-    moved = SceneShift({"agentview": {"left": FRONT}, "wrist": {"left": WRIST}}, 0.05)(given)
+    moved = SceneShift({"agentview": {"left": FRONT}, "wrist": {"left": WRIST}}, 0.05, 1.0)(given)
     assert torch.equal(moved[keys.WRIST_IMAGE], images) and not torch.equal(moved[keys.IMAGE], images)
 
 

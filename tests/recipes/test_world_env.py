@@ -78,7 +78,6 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"evaluate": Evaluate(num_envs=0)}, "evaluate.num_envs must be at least 1"),
         ({"reflector": Reflector(threshold=1.5)}, r"reflector.threshold must be in \(0, 1\), got 1.5"),
         ({"sft": SFT(scene_shift_m=0.3)}, "sft.scene_shift_m must lie between 0 and 0.2 .*, got 0.3"),
-        ({"sft": SFT(scene_shift_share=-0.5)}, "sft.scene_shift_share must lie between 0 and 1, got -0.5"),
         ({"sft": SFT(dim=126)}, "the policy cannot be made of these settings: dim must be a multiple"),
         ({"world_model": WorldModel(patch=8)}, "the world model cannot be made of these settings: patch must leave"),
         ({"world_model": WorldModel(denoise_steps=9)}, "num_denoise_steps must lie between 1 and 4, got 9"),

@@ -57,7 +57,7 @@ class SceneShift:
         self,
         cameras: Mapping[str, Mapping[str, Camera]],
         reach: float,
-        share: float = 1.0,
+        share: float = 0.7,
         height: float | Mapping[str, float] = 0.03,
     ) -> None:
         if not 0 <= reach < math.inf:
@@ -82,8 +82,8 @@ class SceneShift:
         state[:, :2] += move
         out[STATE] = state
         texts = instructions_of(samples)
-        heights = [self.height if isinstance(self.height, float) else self.height[text] for text in texts]
-        height = torch.tensor(heights, device=state.device)
+        heights = [self.height[text] if isinstance(self.height, Mapping) else self.height for text in texts]
+        height = torch.tensor(heights, dtype=state.dtype, device=state.device)
         for name, views in self._views.items():
             index, images = views.indices(texts), samples[image_key(name)].clone()
             height, move = height.to(images.device), move.to(images.device)
@@ -100,7 +100,7 @@ def _moved(images: Tensor, camera: Camera, height: Tensor, move: Tensor) -> Tens
     (rows, columns), device = images.shape[-2:], images.device
     position = torch.tensor(camera.position, dtype=torch.float32, device=device)
     rotation = torch.tensor(camera.rotation, dtype=torch.float32, device=device)
-    focal = 0.5 * rows / math.tan(math.radians(camera.fovy) / 2)
+    focal = float(camera.intrinsics(rows)[0, 0])
     side_down = torch.arange(rows, device=device) + 0.5 - rows / 2
     side_right = torch.arange(columns, device=device) + 0.5 - columns / 2
     down, right = torch.meshgrid(side_down, side_right, indexing="ij")
