@@ -119,6 +119,13 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             f"sft.scene_shift_m must lie between 0 and {_FARTHEST_SHIFT_M} (m), got {config.sft.scene_shift_m}: moved "
             "further, what rises above the table is shown wrongly"
         )
+    if not 0 <= config.sft.aim_weight < float("inf"):
+        raise ValueError(f"sft.aim_weight must be at least 0, got {config.sft.aim_weight}")
+    if config.sft.aim_weight and config.sft.shift_px:
+        raise ValueError(
+            f"sft.aim_weight needs sft.shift_px 0, got {config.sft.shift_px}: the random shift moves the image and not "
+            "the place that is aimed at; sft.scene_shift_m moves both"
+        )
     if config.reflector.path_steps < 0:
         raise ValueError(f"reflector.path_steps must be at least 0, got {config.reflector.path_steps}")
     if not 0 <= config.checkpoint_minutes < float("inf"):

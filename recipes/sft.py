@@ -29,7 +29,9 @@ from worldenv_trl import keys
 from worldenv_trl.data import policy_samples
 from worldenv_trl.devices import device_of, to_device
 from worldenv_trl.language import instructions_of
+from worldenv_trl.objectives import AimedCloning
 from worldenv_trl.policies import (
+    Aims,
     Policy,
     SceneShift,
     TeacherForcing,
@@ -39,6 +41,7 @@ from worldenv_trl.policies import (
     random_shift,
     token_cross_entropy,
 )
+from worldenv_trl.robot import Camera
 from worldenv_trl.row_share import own_rows
 
 
@@ -49,6 +52,8 @@ def fine_tune(run: Run) -> None:
     samples = policy_samples(demonstrations(run), config.chunk_length)
     policy = run.parts.policy.make(config).to(run.device)
     check_ratio_level(config, policy)
+    if config.sft.aim_weight and not isinstance(policy, Aims):
+        raise TypeError(f"sft.aim_weight must be 0 for {type(policy).__name__}, which does not say where it aims")
     policy.fit_statistics(samples[keys.STATE], samples[keys.CHUNK])
     if isinstance(policy, TokenPolicy):
         _clone_tokens(policy, samples, run)
@@ -82,8 +87,9 @@ def _clone_chunks(policy: Policy, samples: TensorDictBase, run: Run) -> None:
     learning = [parameter for parameter in policy.parameters() if parameter.requires_grad]
     others = [parameter for parameter in learning if all(parameter is not each for each in scale)]
 
-    def l1(part: Policy) -> BCLoss:
-        return _behaviour_cloning(laplace_actor(part), loss_function="l1")
+    def l1(part: Policy) -> torch.nn.Module:
+        loss = _behaviour_cloning(laplace_actor(part), loss_function="l1")
+        return AimedCloning(loss, part, _seen(run), settings.aim_weight) if settings.aim_weight else loss
 
     _train(policy, l1, samples, others, settings.steps, settings.lr, run, "l1")
 
@@ -111,6 +117,12 @@ def _behaviour_cloning(
     return loss
 
 
+def _seen(run: Run) -> dict[str, dict[str, Camera]]:
+    """The cameras that the policy looks through, by name and instruction."""
+    seen = run.config.sft.cameras or run.config.cameras
+    return {name: views for name, views in cameras_of(run.config).items() if name in seen}
+
+
 def _lowest(samples: TensorDictBase) -> dict[str, float]:
     """The hand's lowest height (m) in the demonstrations of each instruction: where it takes hold of things."""
     lowest: dict[str, float] = {}
@@ -121,7 +133,7 @@ def _lowest(samples: TensorDictBase) -> dict[str, float]:
 
 def _train(
     policy: Policy,
-    make_loss: Callable[[Any], BCLoss],
+    make_loss: Callable[[Any], torch.nn.Module],
     samples: TensorDictBase,
     parameters: list[torch.nn.Parameter],
     steps: int,
@@ -132,11 +144,9 @@ def _train(
 ) -> None:
     settings, learner = run.config.sft, DataParallel(policy, make_loss, run.config.parallel)
     parameters, rows = learner.trained(parameters), settings.batch_size // processes.size()
-    seen = settings.cameras or run.config.cameras
-    images, shift = [keys.image_key(camera) for camera in seen], None
+    images, shift = [keys.image_key(camera) for camera in settings.cameras or run.config.cameras], None
     if settings.scene_shift_m:
-        cameras = {camera: views for camera, views in cameras_of(run.config).items() if camera in seen}
-        shift = SceneShift(cameras, settings.scene_shift_m, height=_lowest(samples))
+        shift = SceneShift(_seen(run), settings.scene_shift_m, height=_lowest(samples))
     optimizer = torch.optim.AdamW(parameters, lr=lr, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
@@ -158,7 +168,8 @@ def _train(
         optimizer.step()
         schedule.step()
         if step % 50 == 0 or step == steps - 1:
-            run.folder.log("sft", step=step, **{name: value.item()})
+            aim = {"aim": out["loss_aim"].item()} if "loss_aim" in out else {}
+            run.folder.log("sft", step=step, **{name: value.item()}, **aim)
             progress.set_postfix(loss=f"{value.item():.4f}")
     learner.close()
 

@@ -54,3 +54,13 @@ def test_impossible_samples_are_refused():
     empty["length"] = torch.zeros(1, 1, dtype=torch.int64)
     with pytest.raises(ValueError, match="no executed step"):
         policy_samples(empty)
+
+
+def test_the_waypoint_is_where_the_gripper_is_next_told_otherwise():
+    episodes = make_episodes([3, 6, 1])
+    episodes["actions"][..., -1] = -1.0
+    episodes["actions"][1, [2, 3, 5], -1] = 1.0  # closes at 2, opens at 4, closes at 5
+    samples = policy_samples(episodes, chunk_length=2)
+    at = [(0, 3)] * 3 + [(1, step) for step in (2, 2, 4, 4, 5, 6)] + [(2, 1)]
+    expected = torch.stack([episodes["states"][row, step, :3] for row, step in at])
+    assert torch.equal(samples[keys.WAYPOINT], expected)

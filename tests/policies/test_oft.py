@@ -224,3 +224,17 @@ def test_bad_configs_are_named(change, message):
 def test_statistics_need_finite_data():
     with pytest.raises(ValueError, match="finite"):
         oft_policy().fit_statistics(torch.full((3, 7), float("nan")), torch.zeros(3, 7))
+
+
+def test_its_aim_is_a_density_over_the_image_while_it_is_asked_for():
+    policy = oft_policy()
+    plain = loc_of(policy, observed())
+    with policy.aiming() as aims:
+        assert torch.equal(loc_of(policy, observed()), plain)
+    for camera in policy.cameras:
+        side = policy.image_size // 4
+        assert aims[camera].shape == (6, side, side)
+        torch.testing.assert_close(aims[camera].exp().sum((1, 2)), torch.ones(6))
+    asked = dict(aims)
+    policy(observed())
+    assert all(aims[camera] is each for camera, each in asked.items())

@@ -98,6 +98,14 @@ def test_nothing_else_changes_and_what_is_not_moved_keeps_its_bits():
     assert (moved[keys.IMAGE][~still] != images[~still]).flatten(1).any(1).all()
 
 
+def test_the_waypoint_moves_with_the_scene():
+    given = samples(torch.zeros(8, 3, 32, 32, dtype=torch.uint8), more={keys.WAYPOINT: torch.rand(8, 3)})
+    before = given[keys.WAYPOINT].clone()
+    moved = SceneShift({"agentview": {"left": FRONT}}, 0.05, 1.0)(given)
+    torch.testing.assert_close(moved[keys.WAYPOINT] - before, moved[keys.STATE][:, :3])
+    assert torch.equal(given[keys.WAYPOINT], before)
+
+
 def test_a_camera_on_the_tool_sees_what_it_saw():
     images = torch.randint(0, 256, (4, 3, 32, 32), dtype=torch.uint8)
     given = samples(images, more={keys.WRIST_IMAGE: images.clone()})

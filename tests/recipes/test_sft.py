@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import pytest
 import torch
@@ -15,7 +16,7 @@ from episodes import demonstrations
 from stages import open_run
 from worldenv_trl import keys
 from worldenv_trl.data import policy_samples
-from worldenv_trl.policies import SceneShift
+from worldenv_trl.policies import OFTPolicy, SceneShift
 from worldenv_trl.scenes import load_task
 
 TASKS = config.GOAL_TASKS[1:]
@@ -61,3 +62,21 @@ def test_without_it_nothing_is_moved(run, monkeypatch):
     monkeypatch.setattr(sft, "SceneShift", lambda *_, **__: pytest.fail("made"))
     still = dataclasses.replace(run.config.sft, scene_shift_m=0.0)
     sft.fine_tune(dataclasses.replace(run, config=dataclasses.replace(run.config, sft=still)))
+
+
+def test_beside_the_actions_it_is_taught_where_to_aim(run):
+    aimed = dataclasses.replace(run.config.sft, aim_weight=0.5, shift_px=0, steps=60)
+    sft.fine_tune(dataclasses.replace(run, config=dataclasses.replace(run.config, sft=aimed)))
+    logged = [json.loads(line) for line in run.folder.metrics_path.read_text().splitlines()]
+    far = {line["step"]: line["aim"] for line in logged if "aim" in line}
+    assert list(far) == [0, 50, 59] and far[59] < far[0] / 2  # the means' lesson alone
+
+
+def test_a_policy_that_does_not_aim_is_not_taught_to(run, monkeypatch):
+    class Aimless(OFTPolicy):
+        aiming = None
+
+    monkeypatch.setattr("parts.OFTPolicy", Aimless)
+    aimed = dataclasses.replace(run.config.sft, aim_weight=0.5, shift_px=0)
+    with pytest.raises(TypeError, match=r"sft.aim_weight must be 0 for Aimless, which does not say where it aims"):
+        sft.fine_tune(dataclasses.replace(run, config=dataclasses.replace(run.config, sft=aimed)))

@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 
 from worldenv_trl.data.episodes import Episodes
-from worldenv_trl.keys import ACTION_IS_PAD, CHUNK, CHUNK_LENGTH, INSTRUCTION, STATE, image_key
+from worldenv_trl.keys import ACTION_IS_PAD, CHUNK, CHUNK_LENGTH, INSTRUCTION, STATE, WAYPOINT, image_key
 from worldenv_trl.row_texts import row_texts
 
 __all__ = ["policy_samples"]
@@ -17,8 +17,9 @@ def policy_samples(episodes: Episodes, chunk_length: int = CHUNK_LENGTH) -> Tens
 
     Returns a TensorDict [N], episode after episode: ``("observation", ...)`` uint8 [N, 3, H, W] of every camera,
     ``("observation", "state")`` [N, 7], ``language_instruction``, ``("vla_action", "chunk")`` [N, C, 7] with the
-    actions from this step on, and ``action_is_pad`` bool [N, C], True past the end of the episode, where the last
-    action repeats.
+    actions from this step on, ``action_is_pad`` bool [N, C], True past the end of the episode, where the last
+    action repeats, and ``("vla_action", "waypoint")`` [N, 3], the hand's position (m) when the gripper is next told to
+    close or to open, or at the end: where things are taken hold of and let go (keyframes of C2F-ARM, arXiv:2106.12534).
 
     Raises:
         ValueError: for a chunk shorter than one step, or episodes in which nothing was executed.
@@ -38,4 +39,16 @@ def policy_samples(episodes: Episodes, chunk_length: int = CHUNK_LENGTH) -> Tens
         out[image_key(camera)] = episodes.frames(camera, episode, step)
     out.set(INSTRUCTION, row_texts([episodes.instructions[row] for row in episode.tolist()]))
     out[CHUNK], out[ACTION_IS_PAD] = chunk, wanted >= end
+    out[WAYPOINT] = episodes["states"][episode, _next_change(episodes)[episode, step], :3]
     return out
+
+
+def _next_change(episodes: Episodes) -> torch.Tensor:
+    """int64 [R, T]: the first step behind each at which the gripper's command changes, or the episode's end."""
+    closing, length = episodes["actions"][..., -1] > 0, episodes["length"]
+    steps = torch.arange(closing.shape[1], device=length.device)
+    change = torch.zeros_like(closing)
+    change[:, 1:] = closing[:, 1:] != closing[:, :-1]
+    at = torch.where(change & (steps < length), steps, length)
+    behind = torch.cat([at[:, 1:], length], 1)  # a change at this very step lies behind the hand
+    return behind.flip(1).cummin(1).values.flip(1)

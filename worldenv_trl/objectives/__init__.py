@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from worldenv_trl.objectives.aimed_cloning import AimedCloning
 from worldenv_trl.objectives.loop import LOOPLoss
 from worldenv_trl.objectives.reflector import ReflectorLoss
 from worldenv_trl.objectives.rloo import rloo_advantage
 from worldenv_trl.objectives.world_model import WorldModelLoss
 
-__all__ = ["LOOPLoss", "ReflectorLoss", "WorldModelLoss", "rloo_advantage"]
+__all__ = ["AimedCloning", "LOOPLoss", "ReflectorLoss", "WorldModelLoss", "rloo_advantage"]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from typing import Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
@@ -13,7 +15,7 @@ from torch import Tensor, nn
 from worldenv_trl.keys import ACTION_DIM, INSTRUCTION, LOC, LOG_SCALE, STATE, STATE_DIM, image_key
 from worldenv_trl.language import SeenInstructions, instructions_of
 
-__all__ = ["Policy"]
+__all__ = ["Aims", "Policy"]
 
 
 class Policy(TensorDictModuleBase, abc.ABC):
@@ -155,6 +157,15 @@ class Policy(TensorDictModuleBase, abc.ABC):
         if image.dtype != torch.uint8 or tuple(image.shape) != (*batch, *size):
             raise ValueError(f"{key} must be uint8 {[*batch, *size]}, got {image.dtype} {list(image.shape)}")
         return image.reshape(-1, *size)
+
+
+@runtime_checkable
+class Aims(Protocol):
+    """A policy that can say where on each camera's image it takes the hand to go."""
+
+    def aiming(self) -> AbstractContextManager[dict[str, Tensor]]:
+        """While it is open, ``predict`` leaves the log-probabilities [n, h, w] of the image's cells, by camera."""
+        ...
 
 
 def check_rank(rank: int, present: int) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -131,7 +132,8 @@ class _Keypoints(nn.Module):
     A convolutional stem, modulated by the instruction (FiLM, as in OFT+), gives one attention map per token. A token's
     position is the map's mean (spatial softmax, arXiv:1504.00702), its content the features under the map
     (TokenLearner, arXiv:2106.11297). Positions follow the objects by construction, and there are fewer tokens than
-    patches, which halves the cost.
+    patches, which halves the cost. The first one's map is where the policy takes the hand to go, where it is taught to
+    (:class:`~worldenv_trl.objectives.AimedCloning`).
     """
 
     def __init__(self, config: OFTConfig, vision_widths: Sequence[int]):
@@ -162,8 +164,9 @@ class _Keypoints(nn.Module):
         self.content = nn.Linear(widths[-1], config.dim)
         self.slot = nn.Parameter(torch.randn(config.num_keypoints, config.dim) * 0.2)
 
-    def forward(self, image: Tensor, pretrained: Sequence[Tensor], sentence: Tensor) -> tuple[Tensor, Tensor]:
-        """[B, 3, H, W], maps [B, w, h', w'], [B, dim] -> tokens [B, K, dim], their positions [B, K, 2] in [-1, 1]."""
+    def forward(self, image: Tensor, pretrained: Sequence[Tensor], sentence: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """[B, 3, H, W], maps [B, w, h', w'], [B, dim] -> tokens [B, K, dim], their positions [B, K, 2] in [-1, 1], and
+        the first one's map before its softmax [B, h, w]."""
         features = image
         for conv in self.stem[:-1]:
             features = F.relu(conv(features))
@@ -174,10 +177,11 @@ class _Keypoints(nn.Module):
             features = torch.cat([features, F.relu(torch.stack(resized).sum(0))], 1)
         gain, bias = self.film(sentence)[:, :, None, None].chunk(2, 1)
         features = F.relu(self.stem[-1](features) * (1 + gain) + bias)
-        attention = (self.maps(features).flatten(2) * self.log_sharpness.exp()).softmax(-1)  # [B, K, P]
+        maps = self.maps(features) * self.log_sharpness.exp()
+        attention = maps.flatten(2).softmax(-1)  # [B, K, P]
         positions = attention @ self.grid
         content = attention @ features.flatten(2).mT
-        return self.position(positions) + self.content(content) + self.slot, positions
+        return self.position(positions) + self.content(content) + self.slot, positions, maps[:, 0]
 
 
 class _Backbone(nn.Module):
@@ -201,8 +205,9 @@ class _Backbone(nn.Module):
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.depth))
         self.norm = nn.LayerNorm(config.dim)
 
-    def forward(self, images: Sequence[Tensor], state: Tensor, words: Tensor) -> Tensor:
-        """Images of each camera, uint8 [B, 3, H, W], state [B, 7], words int [B, L] -> [B, C, dim]."""
+    def forward(self, images: Sequence[Tensor], state: Tensor, words: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """Images of each camera, uint8 [B, 3, H, W], state [B, 7], words int [B, L] -> [B, C, dim], and the map of
+        each camera's first keypoint [B, h, w]."""
         padded = words == 0
         text = self.words(words) * ~padded[..., None]  # [B, L, dim]
         sentence = text.sum(1) / (~padded).sum(1, keepdim=True).clamp(min=1)
@@ -210,7 +215,7 @@ class _Backbone(nn.Module):
             keypoints(image.float() / 127.5 - 1, self.vision(image) if self.vision is not None else (), sentence)
             for keypoints, image in zip(self.keypoints, images, strict=True)
         ]
-        patches, positions = zip(*seen, strict=True)
+        patches, positions, aims = zip(*seen, strict=True)
         proprio = self.proprio_out(F.gelu(self.proprio_in(state)))[:, None]
         readout = self.readout(torch.cat([*(where.flatten(1) for where in positions), state], -1))
         queries = self.queries + readout.unflatten(-1, self.queries.shape)
@@ -219,7 +224,7 @@ class _Backbone(nn.Module):
         pad = torch.zeros_like(pad, dtype=tokens.dtype).masked_fill(pad, float("-inf"))
         for block in self.blocks[:-1]:
             tokens = block(tokens, pad)
-        return self.norm(self.blocks[-1](tokens, pad, last=self.config.chunk_length))
+        return self.norm(self.blocks[-1](tokens, pad, last=self.config.chunk_length)), aims
 
 
 class OFTPolicy(Policy, Pretrained):
@@ -257,6 +262,7 @@ class OFTPolicy(Policy, Pretrained):
             instructions=config.instructions,
         )
         self.config = config
+        self._aims: dict[str, Tensor] | None = None
         self.vocabulary = Vocabulary(config.vocabulary, config.max_words)
         self._longest = self.vocabulary.ids(config.instructions).shape[1]
         self.backbone = _Backbone(config)
@@ -274,8 +280,20 @@ class OFTPolicy(Policy, Pretrained):
     ) -> tuple[Tensor, Tensor]:
         words = self._words(instructions)
         seen = [images[camera] for camera in self.cameras]
-        hidden = self.backbone(seen, (state - self.state_center) / self.state_half_range, words)  # [n, C, dim]
+        hidden, aims = self.backbone(seen, (state - self.state_center) / self.state_half_range, words)  # [n, C, dim]
+        if self._aims is not None:
+            log_probs = (maps.flatten(1).log_softmax(-1).view_as(maps) for maps in aims)
+            self._aims.update(zip(self.cameras, log_probs, strict=True))
         return self.loc_head(hidden) * self.action_range + self.action_center, self.scale_head(hidden)
+
+    @contextmanager
+    def aiming(self) -> Iterator[dict[str, Tensor]]:
+        """See :class:`~worldenv_trl.policies.Aims`: the map of each camera's first keypoint."""
+        self._aims = {}
+        try:
+            yield self._aims
+        finally:
+            self._aims = None
 
     @torch.compiler.disable  # see Policy._goals
     def _words(self, instructions: Sequence[str]) -> Tensor:

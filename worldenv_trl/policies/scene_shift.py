@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from worldenv_trl.keys import STATE, image_key
+from worldenv_trl.keys import STATE, WAYPOINT, image_key
 from worldenv_trl.kinematics.calibrations import Calibrations, check_instructions, plain_cameras
 from worldenv_trl.language import instructions_of
 from worldenv_trl.robot import Camera
@@ -28,8 +28,9 @@ class SceneShift:
     to where it is, stays the same: an equivariance that a policy of few demonstrations does not find by itself. The
     image is warped by the homography of a horizontal plane; what lies on it moves exactly, what rises above it
     by a parallax that grows with the distance, so small ones are meant. The position in ``("observation", "state")``
-    moves as far. A camera that is mounted on the tool sees what it saw. (DrQ's random shift, arXiv:2004.13649, moves
-    the image and says nothing of the hand; DemoGen, arXiv:2502.16932, moves objects in point clouds.)
+    moves as far, and the waypoint, if there is one. A camera that is mounted on the tool sees what it saw. (DrQ's
+    random shift, arXiv:2004.13649, moves the image and says nothing of the hand; DemoGen, arXiv:2502.16932, moves
+    objects in point clouds.)
 
     Args:
         cameras: ``{camera name: {instruction: camera}}``, what each instruction's scene is seen through.
@@ -81,6 +82,8 @@ class SceneShift:
         move = (2 * drawn[:, :2] - 1) * self.reach * (drawn[:, 2:] < self.share)
         state[:, :2] += move
         out[STATE] = state
+        if WAYPOINT in samples.keys(include_nested=True):
+            out[WAYPOINT] = samples[WAYPOINT] + F.pad(move, (0, 1))
         texts = instructions_of(samples)
         heights = [self.height[text] if isinstance(self.height, Mapping) else self.height for text in texts]
         height = torch.tensor(heights, dtype=state.dtype, device=state.device)
