@@ -16,6 +16,7 @@ from worldenv_trl.reflectors import StopRule
 from worldenv_trl.scenes import load_task
 
 _FARTHEST_SHIFT_M = 0.2
+_FARTHEST_PLACE_M = 0.05  # five eighths of the ring that bends, policies.PlaceShift: its slope stays below one
 
 
 def check_shares(config: WorldEnvConfig, processes: int) -> None:
@@ -118,6 +119,11 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         raise ValueError(
             f"sft.scene_shift_m must lie between 0 and {_FARTHEST_SHIFT_M} (m), got {config.sft.scene_shift_m}: moved "
             "further, what rises above the table is shown wrongly"
+        )
+    if not 0 <= config.sft.place_shift_m <= _FARTHEST_PLACE_M:
+        raise ValueError(
+            f"sft.place_shift_m must lie between 0 and {_FARTHEST_PLACE_M} (m), got {config.sft.place_shift_m}: moved "
+            "further, what is around folds over itself"
         )
     if not 0 <= config.sft.aim_weight < float("inf"):
         raise ValueError(f"sft.aim_weight must be at least 0, got {config.sft.aim_weight}")

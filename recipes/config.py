@@ -55,6 +55,9 @@ class SFT:
     scene_shift_m: float = 0.0
     """Largest distance by which a sample's scene and hand are moved over the table together, along each of its axes:
     demonstrations in places where none was given (``policies.SceneShift``). Before the shift above."""
+    place_shift_m: float = 0.0
+    """Largest distance by which what lies where the gripper next closes or opens is moved, and the actions with it,
+    along each of the table's axes: the policy has to look where the thing is (``policies.PlaceShift``)."""
     aim_weight: float = 0.0
     """Of a second lesson, beside the actions: where on the image the gripper next closes or opens
     (``objectives.AimedCloning``). For policies that aim, and without the random shift above."""

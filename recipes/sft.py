@@ -32,6 +32,7 @@ from worldenv_trl.language import instructions_of
 from worldenv_trl.objectives import AimedCloning
 from worldenv_trl.policies import (
     Aims,
+    PlaceShift,
     Policy,
     SceneShift,
     TeacherForcing,
@@ -144,9 +145,12 @@ def _train(
 ) -> None:
     settings, learner = run.config.sft, DataParallel(policy, make_loss, run.config.parallel)
     parameters, rows = learner.trained(parameters), settings.batch_size // processes.size()
-    images, shift = [keys.image_key(camera) for camera in settings.cameras or run.config.cameras], None
+    images = [keys.image_key(camera) for camera in settings.cameras or run.config.cameras]
+    shifts: list[Callable[[TensorDictBase], TensorDictBase]] = []
+    if settings.place_shift_m:
+        shifts.append(PlaceShift(_seen(run), settings.place_shift_m))
     if settings.scene_shift_m:
-        shift = SceneShift(_seen(run), settings.scene_shift_m, height=_lowest(samples))
+        shifts.append(SceneShift(_seen(run), settings.scene_shift_m, height=_lowest(samples)))
     optimizer = torch.optim.AdamW(parameters, lr=lr, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
@@ -157,19 +161,20 @@ def _train(
         with processes.sharing():
             chosen = own_rows(lambda count: torch.randint(len(samples), (count,)), rows)
             batch = to_device(samples[chosen], run.device)
-            if shift is not None:
+            for shift in shifts:
                 batch = shift(batch)
             for image in images:
                 batch[image] = random_shift(batch[image], settings.shift_px)
         out = learner(batch)
         optimizer.zero_grad()
-        value = learner.backward_mean(out["loss_bc"], (~batch[padding]).sum())
+        losses = {"loss_bc": name, "loss_aim": "aim"}
+        value = learner.backward_mean(sum(out[key] for key in losses if key in out), (~batch[padding]).sum())
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
         schedule.step()
         if step % 50 == 0 or step == steps - 1:
-            aim = {"aim": out["loss_aim"].item()} if "loss_aim" in out else {}
-            run.folder.log("sft", step=step, **{name: value.item()}, **aim)
+            parts = {name: out[key].item() for key, name in losses.items() if key in out}
+            run.folder.log("sft", step=step, **(parts if len(parts) > 1 else {name: value.item()}))
             progress.set_postfix(loss=f"{value.item():.4f}")
     learner.close()
 

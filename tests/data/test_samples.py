@@ -64,3 +64,15 @@ def test_the_waypoint_is_where_the_gripper_is_next_told_otherwise():
     at = [(0, 3)] * 3 + [(1, step) for step in (2, 2, 4, 4, 5, 6)] + [(2, 1)]
     expected = torch.stack([episodes["states"][row, step, :3] for row, step in at])
     assert torch.equal(samples[keys.WAYPOINT], expected)
+
+
+def test_the_approach_is_shared_out_by_how_far_each_action_goes_over_the_table():
+    episodes = make_episodes([6])
+    episodes["actions"].zero_()
+    episodes["actions"][..., -1] = -1.0
+    episodes["actions"][0, 3:, -1] = 1.0  # closes at 3
+    episodes["actions"][0, :3, :2] = torch.tensor([[0.3, 0.4], [0.0, 0.2], [0.0, 0.0]])
+    approach = policy_samples(episodes, chunk_length=2)[keys.APPROACH]
+    told = [0.55, 0.25, 0.05]  # lengths, and .05 for every step
+    expected = [[told[0] / 0.85, told[1] / 0.85], [told[1] / 0.3, told[2] / 0.3], [1.0, 0.0], *[[0.0, 0.0]] * 3]
+    torch.testing.assert_close(approach, torch.tensor(expected))

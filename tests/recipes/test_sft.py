@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from functools import partial
 
 import pytest
 import torch
@@ -80,3 +81,16 @@ def test_a_policy_that_does_not_aim_is_not_taught_to(run, monkeypatch):
     aimed = dataclasses.replace(run.config.sft, aim_weight=0.5, shift_px=0)
     with pytest.raises(TypeError, match=r"sft.aim_weight must be 0 for Aimless, which does not say where it aims"):
         sft.fine_tune(dataclasses.replace(run, config=dataclasses.replace(run.config, sft=aimed)))
+
+
+def test_places_are_moved_before_the_scene(run, monkeypatch):
+    order = []
+
+    def making(name, cameras, reach, **_):
+        return lambda samples: order.append((name, reach)) or samples
+
+    for name in ("SceneShift", "PlaceShift"):
+        monkeypatch.setattr(sft, name, partial(making, name))
+    both = dataclasses.replace(run.config.sft, place_shift_m=0.02, steps=1)
+    sft.fine_tune(dataclasses.replace(run, config=dataclasses.replace(run.config, sft=both)))
+    assert order == [("PlaceShift", 0.02), ("SceneShift", 0.05)] * 2  # the means' lesson, then the scale's

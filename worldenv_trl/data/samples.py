@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict
 
 from worldenv_trl.data.episodes import Episodes
-from worldenv_trl.keys import ACTION_IS_PAD, CHUNK, CHUNK_LENGTH, INSTRUCTION, STATE, WAYPOINT, image_key
+from worldenv_trl.keys import ACTION_IS_PAD, APPROACH, CHUNK, CHUNK_LENGTH, INSTRUCTION, STATE, WAYPOINT, image_key
 from worldenv_trl.row_texts import row_texts
 
 __all__ = ["policy_samples"]
+
+_STEP = 0.05  # of an action, so that a step in which the hand does not move over the table counts as one
 
 
 def policy_samples(episodes: Episodes, chunk_length: int = CHUNK_LENGTH) -> TensorDict:
@@ -20,6 +23,8 @@ def policy_samples(episodes: Episodes, chunk_length: int = CHUNK_LENGTH) -> Tens
     actions from this step on, ``action_is_pad`` bool [N, C], True past the end of the episode, where the last
     action repeats, and ``("vla_action", "waypoint")`` [N, 3], the hand's position (m) when the gripper is next told to
     close or to open, or at the end: where things are taken hold of and let go (keyframes of C2F-ARM, arXiv:2106.12534).
+    ``("vla_action", "approach")`` [N, C] is the share of the way over the table to there, from this step on, that each
+    action goes; 0 where the episode ends without another change.
 
     Raises:
         ValueError: for a chunk shorter than one step, or episodes in which nothing was executed.
@@ -39,8 +44,20 @@ def policy_samples(episodes: Episodes, chunk_length: int = CHUNK_LENGTH) -> Tens
         out[image_key(camera)] = episodes.frames(camera, episode, step)
     out.set(INSTRUCTION, row_texts([episodes.instructions[row] for row in episode.tolist()]))
     out[CHUNK], out[ACTION_IS_PAD] = chunk, wanted >= end
-    out[WAYPOINT] = episodes["states"][episode, _next_change(episodes)[episode, step], :3]
+    change = _next_change(episodes)[episode, step]
+    out[WAYPOINT] = episodes["states"][episode, change, :3]
+    ahead = (wanted < change.unsqueeze(-1)) & (change.unsqueeze(-1) < end)
+    way = _way(episodes)
+    at = way[episode.unsqueeze(-1), torch.cat([wanted, wanted[:, -1:] + 1], 1).minimum(end)]  # [N, C + 1]
+    out[APPROACH] = ahead * at.diff(dim=1) / (way[episode, change] - way[episode, step]).unsqueeze(-1)
     return out
+
+
+def _way(episodes: Episodes) -> torch.Tensor:
+    """[R, T + 1]: how far over the table the hand has been told to go until each step, and a little for every step:
+    where it goes straight down, what is left of the way is shared evenly."""
+    told = episodes["actions"][..., :2].norm(dim=-1) + _STEP
+    return F.pad(told.cumsum(1), (1, 0))
 
 
 def _next_change(episodes: Episodes) -> torch.Tensor:

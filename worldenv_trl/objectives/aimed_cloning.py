@@ -34,7 +34,7 @@ class AimedCloning(nn.Module):
         loss: from samples [B] to a TensorDict with ``loss_bc``; calls ``policy`` once.
         policy: whose aim is taught.
         cameras: ``{camera name: {instruction: camera}}``, what each instruction's scene is seen through.
-        weight: of the divergence (nats) in ``loss_bc``.
+        weight: of the divergence (nats) in ``loss_aim``.
         width: standard deviation of the target, in cells of the policy's maps.
 
     Raises:
@@ -85,17 +85,14 @@ class AimedCloning(nn.Module):
         self._aiming = policy.aiming  # not the module: it is the loss's
 
     def forward(self, samples: TensorDictBase) -> Any:
-        """``loss_bc`` with the aim's part in it, and ``loss_aim``, unweighted, for samples [B] of
-        :func:`~worldenv_trl.data.policy_samples`."""
+        """``loss_bc`` and ``loss_aim``, to be summed, for samples [B] of :func:`~worldenv_trl.data.policy_samples`."""
         with self._aiming() as aims:
             out = self.loss(samples)
         texts, where = instructions_of(samples), samples[WAYPOINT]
         # Of actions, like the cloning loss: so that processes that share a batch add up to one.
         rows = (~samples[ACTION_IS_PAD]).sum(-1)
         far = torch.stack([self._divergence(name, each, texts, where) for name, each in aims.items()])
-        aim = (far.mean(0) * rows).sum() / rows.sum().clamp_min(1)
-        out["loss_aim"] = aim.detach()
-        out["loss_bc"] = out["loss_bc"] + self.weight * aim
+        out["loss_aim"] = self.weight * (far.mean(0) * rows).sum() / rows.sum().clamp_min(1)
         return out
 
     def _divergence(self, name: str, log_probs: Tensor, texts: Sequence[str], where: Tensor) -> Tensor:

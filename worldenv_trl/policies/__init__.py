@@ -19,6 +19,7 @@ from worldenv_trl.policies.oft import OFTConfig, OFTPolicy
 from worldenv_trl.policies.openvla import load_openvla
 from worldenv_trl.policies.openvla_oft import load_openvla_oft
 from worldenv_trl.policies.pairing import check_pairing
+from worldenv_trl.policies.place_shift import PlaceShift
 from worldenv_trl.policies.scene_shift import SceneShift
 from worldenv_trl.policies.serving import ServedPolicy
 from worldenv_trl.policies.token_actor import IndependentCategorical, TokenActor, token_actor
@@ -44,6 +45,7 @@ __all__ = [
     "LaplaceActor",
     "OFTConfig",
     "OFTPolicy",
+    "PlaceShift",
     "Policy",
     "QuantileActionTokenizer",
     "SceneShift",

@@ -100,19 +100,33 @@ class SceneShift:
 
 def _moved(images: Tensor, camera: Camera, height: Tensor, move: Tensor) -> Tensor:
     """Images uint8 [n, 3, H, W] of ``camera`` when what lies at ``height`` [n] (m) has moved by ``move`` [n, 2] (m)."""
+    # A pixel shows the point of the plane that it now sees, where that point was before: backward warping.
+    return warped(images, camera, plane(images, camera, height) - F.pad(move, (0, 1))[:, None, None])
+
+
+def plane(images: Tensor, camera: Camera, height: Tensor) -> Tensor:
+    """Where the ray of each pixel of images [n, 3, H, W] meets the level plane at ``height`` [n] (m): [n, H, W, 3]."""
     (rows, columns), device = images.shape[-2:], images.device
-    position = torch.tensor(camera.position, dtype=torch.float32, device=device)
-    rotation = torch.tensor(camera.rotation, dtype=torch.float32, device=device)
-    focal = float(camera.intrinsics(rows)[0, 0])
+    position, rotation, focal = _pose(camera, rows, device)
     side_down = torch.arange(rows, device=device) + 0.5 - rows / 2
     side_right = torch.arange(columns, device=device) + 0.5 - columns / 2
     down, right = torch.meshgrid(side_down, side_right, indexing="ij")
     rays = torch.stack([right / focal, -down / focal, -torch.ones_like(down)], -1) @ rotation.T  # [H, W, 3]
-    # A pixel shows the point of the plane that it now sees, where that point was before: backward warping.
     far = (height[:, None, None, None] - position[2]) / rays[..., 2:].clamp(max=-_LEVEL)
-    seen = position + far * rays - F.pad(move, (0, 1))[:, None, None]  # [n, H, W, 3]
-    local = (seen - position) @ rotation
+    return position + far * rays
+
+
+def warped(images: Tensor, camera: Camera, points: Tensor) -> Tensor:
+    """Images uint8 [n, 3, H, W] whose pixels show what ``camera`` sees at ``points`` [n, H, W, 3] (m)."""
+    rows, columns = images.shape[-2:]
+    position, rotation, focal = _pose(camera, rows, images.device)
+    local = (points - position) @ rotation
     scale = focal / -local[..., 2:]
     grid = local[..., :2] * scale * local.new_tensor([2 / columns, -2 / rows])
-    warped = F.grid_sample(images.float(), grid, padding_mode="border", align_corners=False)
-    return warped.round().to(images.dtype)
+    return F.grid_sample(images.float(), grid, padding_mode="border", align_corners=False).round().to(images.dtype)
+
+
+def _pose(camera: Camera, rows: int, device: torch.device) -> tuple[Tensor, Tensor, float]:
+    position = torch.tensor(camera.position, dtype=torch.float32, device=device)
+    rotation = torch.tensor(camera.rotation, dtype=torch.float32, device=device)
+    return position, rotation, float(camera.intrinsics(rows)[0, 0])
