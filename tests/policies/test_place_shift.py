@@ -5,30 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from spots import FRONT, SIDE, centre, spot
 from tensordict import NonTensorStack, TensorDict
 
 from worldenv_trl import keys
 from worldenv_trl.policies import PlaceShift
-from worldenv_trl.robot import WRIST, look_at
+from worldenv_trl.robot import WRIST
 from worldenv_trl.row_share import row_share
 
-FRONT = look_at("agentview", (0.8, 0.1, 0.6), (0.0, 0.0, 0.1), 40.0)
-SIDE = look_at("agentview", (0.1, 0.9, 0.5), (0.0, 0.0, 0.0), 50.0)
 CAMERAS = {"agentview": {"left": FRONT, "right": SIDE}}
 STEPS = 6  # until the gripper closes
-
-
-def blob(camera, point, size=64):
-    """An image of a soft white spot where ``camera`` sees ``point``."""
-    x, y = camera.project(np.asarray(point, dtype=float), size)
-    side = torch.arange(size) + 0.5
-    spot = torch.exp(-((side[None] - x) ** 2 + (side[:, None] - y) ** 2) / 2)
-    return (255 * spot).round().to(torch.uint8).expand(3, size, size)
-
-
-def centre(image):
-    weight, side = image[0].float(), torch.arange(image.shape[-1]) + 0.5
-    return torch.stack([(weight.sum(0) * side).sum(), (weight.sum(1) * side).sum()]) / weight.sum()
 
 
 def demonstrated(rows, place=(0.02, -0.03, 0.05), hand=(-0.25, 0.1, 0.3), more=None):
@@ -39,7 +25,7 @@ def demonstrated(rows, place=(0.02, -0.03, 0.05), hand=(-0.25, 0.1, 0.3), more=N
     chunk[:, STEPS:, 6] = 1.0
     approach = (torch.arange(8) < STEPS).float().expand(rows, 8) / STEPS
     state = torch.cat([hand, torch.zeros(4)]).expand(rows, 7)
-    images = torch.stack([blob((FRONT, SIDE)[row % 2], place.tolist()) for row in range(rows)])
+    images = torch.stack([spot((FRONT, SIDE)[row % 2], place.tolist(), 1.0) for row in range(rows)])
     entries = {keys.STATE: state, keys.IMAGE: images, keys.CHUNK: chunk, keys.APPROACH: approach}
     out = TensorDict(entries | {keys.WAYPOINT: place.expand(rows, 3)} | (more or {}), [rows])
     return out.set(keys.INSTRUCTION, NonTensorStack(*[("left", "right")[row % 2] for row in range(rows)]))

@@ -6,15 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from spots import FRONT, SIDE, centre, spot
 from tensordict import NonTensorStack, TensorDict
 
 from worldenv_trl import keys
 from worldenv_trl.policies import SceneShift
-from worldenv_trl.robot import WRIST, look_at
+from worldenv_trl.robot import WRIST
 from worldenv_trl.row_share import row_share
-
-FRONT = look_at("agentview", (0.8, 0.1, 0.6), (0.0, 0.0, 0.1), 40.0)
-SIDE = look_at("agentview", (0.1, 0.9, 0.5), (0.0, 0.0, 0.0), 50.0)
 
 
 def samples(images, texts=("left",), more=None):
@@ -22,23 +20,10 @@ def samples(images, texts=("left",), more=None):
     return out.set(keys.INSTRUCTION, NonTensorStack(*[texts[row % len(texts)] for row in range(len(images))]))
 
 
-def blob(camera, point, size):
-    """An image of a soft white spot where ``camera`` sees ``point``."""
-    x, y = camera.project(np.array(point), size)
-    side = torch.arange(size) + 0.5
-    spot = torch.exp(-((side[None] - x) ** 2 + (side[:, None] - y) ** 2) / 8)
-    return (255 * spot).round().to(torch.uint8).expand(3, size, size)
-
-
-def centre(image):
-    weight, side = image[0].float(), torch.arange(image.shape[-1]) + 0.5
-    return torch.stack([(weight.sum(0) * side).sum(), (weight.sum(1) * side).sum()]) / weight.sum()
-
-
 def test_what_lies_on_the_plane_is_seen_where_the_hand_says_that_it_is():
     torch.manual_seed(0)
     cameras, points = {"agentview": {"left": FRONT, "right": SIDE}}, ((0.02, -0.03, 0.05), (0.01, 0.04, 0.15))
-    images = torch.stack([blob((FRONT, SIDE)[row % 2], points[row % 2], 64) for row in range(12)])
+    images = torch.stack([spot((FRONT, SIDE)[row % 2], points[row % 2], 2.0) for row in range(12)])
     moved = SceneShift(cameras, 0.06, 1.0, height={"left": 0.05, "right": 0.15})(samples(images, ("left", "right")))
     move = moved[keys.STATE][:, :3]
     assert move[:, 2].abs().max() == 0 and move[:, :2].abs().max() <= 0.06 and move[:, :2].std(0).min() > 0.02
