@@ -60,7 +60,8 @@ class SFT:
     along each of the table's axes: the policy has to look where the thing is (``policies.PlaceShift``)."""
     aim_weight: float = 0.0
     """Of a second lesson, beside the actions: where on the image the gripper next closes or opens
-    (``objectives.AimedCloning``). For policies that aim, and without the random shift above."""
+    (``objectives.AimedCloning``). For policies that aim, others learn their actions alone; without the random shift
+    above."""
     cameras: tuple[str, ...] = ()
     """Cameras that the policy looks through, of the run's; all of them when empty. World model and reflector may see
     more than it does."""
@@ -307,7 +308,14 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
             run_dir=Path("runs/improve"),
             train_states=150,
             demonstrate=Demonstrate(states="spread"),
-            sft=SFT(steps=3000, vision_blocks=(2, 4, 10)),
+            sft=SFT(
+                steps=3000,
+                shift_px=0,
+                scene_shift_m=0.025,
+                place_shift_m=0.025,
+                aim_weight=0.5,
+                vision_blocks=(2, 4, 10),
+            ),
             explore=Explore(episodes_per_task=480),
             reflector=Reflector(choose_threshold=True, path_steps=800),
             post_train=PostTrain(

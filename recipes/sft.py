@@ -53,8 +53,6 @@ def fine_tune(run: Run) -> None:
     samples = policy_samples(demonstrations(run), config.chunk_length)
     policy = run.parts.policy.make(config).to(run.device)
     check_ratio_level(config, policy)
-    if config.sft.aim_weight and not isinstance(policy, Aims):
-        raise TypeError(f"sft.aim_weight must be 0 for {type(policy).__name__}, which does not say where it aims")
     policy.fit_statistics(samples[keys.STATE], samples[keys.CHUNK])
     if isinstance(policy, TokenPolicy):
         _clone_tokens(policy, samples, run)
@@ -88,9 +86,16 @@ def _clone_chunks(policy: Policy, samples: TensorDictBase, run: Run) -> None:
     learning = [parameter for parameter in policy.parameters() if parameter.requires_grad]
     others = [parameter for parameter in learning if all(parameter is not each for each in scale)]
 
+    aims = settings.aim_weight and isinstance(policy, Aims)
+    if settings.aim_weight and not aims:
+        warnings.warn(
+            f"{type(policy).__name__} does not say where it aims: it learns actions alone, without sft.aim_weight",
+            stacklevel=2,
+        )
+
     def l1(part: Policy) -> torch.nn.Module:
         loss = _behaviour_cloning(laplace_actor(part), loss_function="l1")
-        return AimedCloning(loss, part, _seen(run), settings.aim_weight) if settings.aim_weight else loss
+        return AimedCloning(loss, part, _seen(run), settings.aim_weight) if aims else loss
 
     _train(policy, l1, samples, others, settings.steps, settings.lr, run, "l1")
 
