@@ -31,18 +31,18 @@ class PlaceShift:
     On the level plane through that place all within ``inner`` moves, nothing beyond ``outer``, smoothly less
     between. A hand that is seen within moves with what is there, and the actions make up for the rest, as
     ``("vla_action", "approach")`` shares it out. Things that rise above the plane move by a parallax more, and what is
-    between bends: small distances are meant. Samples with no such place ahead, and cameras mounted on the tool, stay
-    as they are.
+    between bends: small distances are meant. Samples with no such place ahead stay as they are.
 
     Args:
-        cameras: ``{camera name: {instruction: camera}}``, what each instruction's scene is seen through; in the first
-            one is seen how far the hand moves with it.
+        cameras: ``{camera name: {instruction: camera}}``, what each instruction's scene is seen through, none of them
+            mounted on the tool; in the first one is seen how far the hand moves with the thing.
         reach: largest distance (m) along each of the table's two axes, drawn uniformly.
         share: of the samples that are changed, in [0, 1].
         inner, outer: radii (m).
 
     Raises:
-        ValueError: for a negative reach, a share or radii out of range, or cameras of different instructions.
+        ValueError: for a negative reach, a share or radii out of range, a camera on the tool, or cameras of different
+            instructions.
     """
 
     def __init__(
@@ -62,6 +62,12 @@ class PlaceShift:
         plain = plain_cameras(cameras)
         check_instructions(plain, "PlaceShift")
         self._views = {name: Calibrations(each) for name, each in plain.items()}
+        for name, views in self._views.items():
+            if views.any_mounted:
+                raise ValueError(
+                    f"the camera {name} is mounted on the tool and would show the thing where it was: move no places "
+                    "(sft.place_shift_m 0), or let the policy look through the others alone (sft.cameras)"
+                )
         self._first = next(iter(self._views))
         self.reach, self.share, self.inner, self.outer = reach, share, inner, outer
 
@@ -81,7 +87,7 @@ class PlaceShift:
             index, images = views.indices(texts), samples[image_key(name)].clone()
             for number, camera in enumerate(views.distinct):
                 rows = ((index == number) & moves.squeeze(-1).cpu()).nonzero().squeeze(-1)
-                if not len(rows) or camera.mount != "world":
+                if not len(rows):
                     continue
                 at, by = place[rows].to(images.device), move[rows].to(images.device)
                 seen = plane(images[rows], camera, at[:, 2])
