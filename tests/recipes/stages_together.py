@@ -53,7 +53,7 @@ def learn(run, **options) -> None:
         patch.setattr(updates, "_PIXELS", 1)  # sixteen decisions at once: a share takes one turn or two
         # Advantages of a group sum to zero, so a gradient of what all its rows share is rounding, which differs from
         # CPU to CPU, and Adam would divide it by its own size.
-        patch.setattr(torch.optim, "AdamW", functools.partial(torch.optim.AdamW, eps=1e-5))
+        patch.setattr(torch.optim, "AdamW", functools.partial(torch.optim.AdamW, eps=1e-6))
         post_train(run, **options, returns_of=returns_of)
 
 

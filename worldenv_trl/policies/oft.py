@@ -155,7 +155,7 @@ class _Keypoints(nn.Module):
         self.film = nn.Linear(config.dim, 2 * widths[-1])
         nn.init.normal_(self.film.weight, std=0.1)
         nn.init.zeros_(self.film.bias)
-        self.maps = nn.Conv2d(widths[-1], config.num_keypoints, 1)
+        self.maps = nn.Conv2d(widths[-1], config.num_keypoints, 1, bias=False)  # softmax does not see a bias
         self.log_sharpness = nn.Parameter(torch.ones(()))
         side = torch.linspace(-1, 1, config.image_size // 4)
         grid = torch.stack(torch.meshgrid(side, side, indexing="ij"), -1).flatten(0, 1)
