@@ -16,7 +16,7 @@ from worldenv_trl.reflectors import StopRule
 from worldenv_trl.scenes import load_task
 
 _FARTHEST_SHIFT_M = 0.2
-_FARTHEST_PLACE_M = 0.05  # five eighths of the ring that bends, policies.PlaceShift: its slope stays below one
+_FARTHEST_PLACE_M = 0.035  # of the radii that policies.PlaceShift has by default
 
 
 def check_shares(config: WorldEnvConfig, processes: int) -> None:

@@ -86,8 +86,8 @@ def _clone_chunks(policy: Policy, samples: TensorDictBase, run: Run) -> None:
     learning = [parameter for parameter in policy.parameters() if parameter.requires_grad]
     others = [parameter for parameter in learning if all(parameter is not each for each in scale)]
 
-    aims = settings.aim_weight and isinstance(policy, Aims)
-    if settings.aim_weight and not aims:
+    aims = settings.aim_weight > 0 and isinstance(policy, Aims)
+    if settings.aim_weight > 0 and not aims:
         warnings.warn(
             f"{type(policy).__name__} does not say where it aims: it learns actions alone, without sft.aim_weight",
             stacklevel=2,
@@ -172,14 +172,15 @@ def _train(
                 batch[image] = random_shift(batch[image], settings.shift_px)
         out = learner(batch)
         optimizer.zero_grad()
-        losses = {"loss_bc": name, "loss_aim": "aim"}
-        value = learner.backward_mean(sum(out[key] for key in losses if key in out), (~batch[padding]).sum())
+        value = learner.backward_mean(sum(out.values()), (~batch[padding]).sum())
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
         schedule.step()
         if step % 50 == 0 or step == steps - 1:
-            parts = {name: out[key].item() for key, name in losses.items() if key in out}
-            run.folder.log("sft", step=step, **(parts if len(parts) > 1 else {name: value.item()}))
+            logged = {name: value.item()}
+            if "loss_aim" in out:  # of the main process's rows
+                logged = {name: out["loss_bc"].item(), "aim": out["loss_aim"].item()}
+            run.folder.log("sft", step=step, **logged)
             progress.set_postfix(loss=f"{value.item():.4f}")
     learner.close()
 

@@ -35,8 +35,8 @@ SCALE = ("vla_action", "scale")  # float32 [*B, C, 7], exp(log-scale)
 LOG_SCALE = ("vla_action", "log_scale")  # float32 [*B, C, 7], the scale head's raw output
 LOG_PROBS = ("vla_action", "log_probs")  # float32 [*B, C], summed over the 7 dimensions; of tokens like them
 ACTION_IS_PAD = "action_is_pad"  # bool [*B, C]
-APPROACH = ("vla_action", "approach")  # float32 [*B, C], what each action goes of the way to there, 0 if nothing is
 WAYPOINT = ("vla_action", "waypoint")  # float32 [*B, 3], where the hand is when its gripper is next told otherwise (m)
+APPROACH = ("vla_action", "approach")  # float32 [*B, C], share of the way to the waypoint that each action goes
 
 FRAMES = "frames"  # ("frames", entry) uint8 [*B, C, 3, H, W] by camera, what one decision produced; see frames_key
 STATES = "states"  # float32 [*B, C, 7], the proprioception that goes with the frames

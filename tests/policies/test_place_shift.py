@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from spots import FRONT, SIDE, centre, spot
+from spots import FRONT, SIDE, centre, check_shared, spot
 from tensordict import NonTensorStack, TensorDict
 
 from worldenv_trl import keys
 from worldenv_trl.policies import PlaceShift
 from worldenv_trl.robot import WRIST
-from worldenv_trl.row_share import row_share
 
 CAMERAS = {"agentview": {"left": FRONT, "right": SIDE}}
 STEPS = 6  # until the gripper closes
@@ -96,15 +95,7 @@ def test_a_camera_on_the_tool_is_refused_as_it_would_show_the_thing_where_it_was
 
 
 def test_processes_that_share_a_batch_change_it_as_one_would():
-    shift, whole = PlaceShift(CAMERAS, 0.03), demonstrated(4)
-    torch.manual_seed(3)
-    expected = shift(whole)
-    for rank in range(2):
-        torch.manual_seed(3)
-        with row_share(rank, 2):
-            found = shift(whole[2 * rank : 2 * rank + 2])
-        for key in (keys.IMAGE, keys.STATE, keys.CHUNK, keys.WAYPOINT):
-            assert torch.equal(found[key], expected[key][2 * rank : 2 * rank + 2])
+    check_shared(PlaceShift(CAMERAS, 0.03), demonstrated(4), (keys.IMAGE, keys.STATE, keys.CHUNK, keys.WAYPOINT))
 
 
 @pytest.mark.parametrize(
@@ -112,6 +103,7 @@ def test_processes_that_share_a_batch_change_it_as_one_would():
     [
         ({"reach": -0.1}, "reach must be at least 0 m, got -0.1"),
         ({"reach": 0.1, "share": 2.0}, "share must lie .* got 2.0"),
+        ({"reach": 0.04}, "reach must be less than 0.038 m with these radii, got 0.04: .* folds"),
         ({"reach": 0.1, "inner": 0.2, "outer": 0.1}, "inner must be .* less than outer, got 0.2 and 0.1"),
     ],
 )

@@ -6,13 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from spots import FRONT, SIDE, centre, spot
+from spots import FRONT, SIDE, centre, check_shared, spot
 from tensordict import NonTensorStack, TensorDict
 
 from worldenv_trl import keys
 from worldenv_trl.policies import SceneShift
 from worldenv_trl.robot import WRIST
-from worldenv_trl.row_share import row_share
 
 
 def samples(images, texts=("left",), more=None):
@@ -100,15 +99,7 @@ def test_a_camera_on_the_tool_sees_what_it_saw():
 
 def test_processes_that_share_a_batch_move_it_as_one_would():
     images = torch.randint(0, 256, (4, 3, 32, 32), dtype=torch.uint8)
-    shift, whole = SceneShift({"agentview": {"left": FRONT}}, 0.05), samples(images)
-    torch.manual_seed(3)
-    expected = shift(whole)
-    for rank in range(2):
-        torch.manual_seed(3)
-        with row_share(rank, 2):
-            found = shift(whole[2 * rank : 2 * rank + 2])
-        assert torch.equal(found[keys.IMAGE], expected[keys.IMAGE][2 * rank : 2 * rank + 2])
-        assert torch.equal(found[keys.STATE], expected[keys.STATE][2 * rank : 2 * rank + 2])
+    check_shared(SceneShift({"agentview": {"left": FRONT}}, 0.05), samples(images), (keys.IMAGE, keys.STATE))
 
 
 @pytest.mark.parametrize(

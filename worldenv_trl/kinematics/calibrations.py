@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -53,6 +53,14 @@ class Calibrations:
         self._commonest = Counter(self._index.values()).most_common(1)[0][0]
         mounted = [camera.mount == "tool" for camera in self.distinct]
         self.mounted, self.any_mounted = torch.tensor(mounted, device="cpu"), any(mounted)
+
+    def rows(self, texts: Sequence[str]) -> Iterator[tuple[Camera, Tensor]]:
+        """Each calibration that scenes of these texts have, and which of them, int64 [m] on the CPU."""
+        index = self.indices(texts)
+        for number, camera in enumerate(self.distinct):
+            rows = (index == number).nonzero().squeeze(-1)
+            if len(rows):
+                yield camera, rows
 
     def indices(self, texts: Sequence[str]) -> Tensor:
         """int64 [n], on the CPU: it is checked there, and a GPU does not wait."""

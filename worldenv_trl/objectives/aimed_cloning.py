@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from worldenv_trl.keys import ACTION_IS_PAD, POSE_DIM, WAYPOINT
+from worldenv_trl.keys import ACTION_IS_PAD, WAYPOINT
 from worldenv_trl.kinematics import ActionMap
 from worldenv_trl.kinematics.calibrations import Calibrations, check_instructions, plain_cameras
 from worldenv_trl.language import instructions_of
@@ -38,7 +38,8 @@ class AimedCloning(nn.Module):
         width: standard deviation of the target, in cells of the policy's maps.
 
     Raises:
-        ValueError: for a negative weight, a width that is not positive, or cameras of different instructions.
+        ValueError: for a negative weight, a width that is not positive, no camera that stands still, or cameras of
+            different instructions.
         TypeError: for a policy that does not aim.
 
     Examples:
@@ -81,7 +82,10 @@ class AimedCloning(nn.Module):
         check_instructions(plain, "AimedCloning")
         self.loss, self.weight, self.width = loss, weight, width
         views = {name: Calibrations(each) for name, each in plain.items()}
-        self._views = {name: (each, ActionMap(each.distinct, _SIDE)) for name, each in views.items()}
+        fixed = {name: each for name, each in views.items() if not each.any_mounted}
+        if not fixed:
+            raise ValueError(f"one camera at least must stand still to be aimed with, got {', '.join(views)}")
+        self._views = {name: (each, ActionMap(each.distinct, _SIDE)) for name, each in fixed.items()}
         self._aiming = policy.aiming  # not the module: it is the loss's
 
     def forward(self, samples: TensorDictBase) -> Any:
@@ -91,19 +95,17 @@ class AimedCloning(nn.Module):
         texts, where = instructions_of(samples), samples[WAYPOINT]
         # Of actions, like the cloning loss: so that processes that share a batch add up to one.
         rows = (~samples[ACTION_IS_PAD]).sum(-1)
-        far = torch.stack([self._divergence(name, each, texts, where) for name, each in aims.items()])
+        far = torch.stack([self._divergence(name, aims[name], texts, where) for name in self._views])
         out["loss_aim"] = self.weight * (far.mean(0) * rows).sum() / rows.sum().clamp_min(1)
         return out
 
     def _divergence(self, name: str, log_probs: Tensor, texts: Sequence[str], where: Tensor) -> Tensor:
         """[n] nats of one camera's log-probabilities [n, h, w] against points [n, 3]; 0 where there is no place."""
         (views, maps), side, device = self._views[name], log_probs.shape[-1], where.device
-        index = views.indices(texts)
-        tool = where.new_zeros(len(where), POSE_DIM) if views.any_mounted else None  # of cameras that are left out
-        seen = maps.to(device).project(where, index, tool) * (side / _SIDE)  # [n, 2], in cells
+        seen = maps.to(device).project(where, views.indices(texts)) * (side / _SIDE)  # [n, 2], in cells
         cells = torch.arange(side, device=device) + 0.5
         right, down = ((cells - each[:, None]).square() for each in seen.unbind(-1))  # [n, side] each
         target = (-(down[:, :, None] + right[:, None]) / (2 * self.width**2)).flatten(1).log_softmax(-1)
         far = (target.exp() * (target - log_probs.flatten(1))).sum(-1)
-        inside = ((seen > 0) & (seen < side)).all(-1) & ~views.mounted[index].to(device)
+        inside = ((seen > 0) & (seen < side)).all(-1)
         return torch.where(inside, far, torch.zeros_like(far))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-import torch
 import torch.nn.functional as F
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -13,11 +12,12 @@ from torch import Tensor
 from worldenv_trl.keys import APPROACH, CHUNK, POSITION_STEP, STATE, WAYPOINT, image_key
 from worldenv_trl.kinematics.calibrations import Calibrations, check_instructions, plain_cameras
 from worldenv_trl.language import instructions_of
-from worldenv_trl.policies.scene_shift import plane, warped
+from worldenv_trl.policies.scene_shift import check_moves, draw_moves, plane, warped
 from worldenv_trl.robot import Camera
-from worldenv_trl.row_share import own_rows
 
 __all__ = ["PlaceShift"]
+
+_STEEPEST = 1.5  # slope of the smooth step between the radii, times their distance
 
 
 class PlaceShift:
@@ -41,8 +41,8 @@ class PlaceShift:
         inner, outer: radii (m).
 
     Raises:
-        ValueError: for a negative reach, a share or radii out of range, a camera on the tool, or cameras of different
-            instructions.
+        ValueError: for a reach below 0 or one that folds the image, a share or radii out of range, a camera on the
+            tool, or cameras of different instructions.
     """
 
     def __init__(
@@ -53,12 +53,14 @@ class PlaceShift:
         inner: float = 0.06,
         outer: float = 0.14,
     ) -> None:
-        if not 0 <= reach < math.inf:
-            raise ValueError(f"reach must be at least 0 m, got {reach}")
-        if not 0 <= share <= 1:
-            raise ValueError(f"share must lie between 0 and 1, got {share}")
+        check_moves(reach, share)
         if not 0 <= inner < outer:
             raise ValueError(f"inner must be at least 0 m and less than outer, got {inner} and {outer}")
+        if _STEEPEST * math.sqrt(2) * reach >= outer - inner:  # along both axes at once
+            raise ValueError(
+                f"reach must be less than {(outer - inner) / _STEEPEST / math.sqrt(2):.3f} m with these radii, got "
+                f"{reach}: moved further, what is between them folds over itself"
+            )
         plain = plain_cameras(cameras)
         check_instructions(plain, "PlaceShift")
         self._views = {name: Calibrations(each) for name, each in plain.items()}
@@ -79,18 +81,15 @@ class PlaceShift:
             KeyError: if an entry is missing.
         """
         out, place, approach = samples.copy(), samples[WAYPOINT], samples[APPROACH]
-        drawn = own_rows(lambda rows: torch.rand(rows, 3), len(samples)).to(place.device)
-        moves = (drawn[:, 2:] < self.share) & (approach.sum(-1, keepdim=True) > 0)
-        move = (2 * drawn[:, :2] - 1) * self.reach * moves
+        move = draw_moves(len(samples), self.reach, self.share).to(place.device)
+        move *= approach.sum(-1, keepdim=True) > 0
         texts, carried = instructions_of(samples), place.new_zeros(len(samples))  # of the move, with the thing
         for name, views in self._views.items():
-            index, images = views.indices(texts), samples[image_key(name)].clone()
-            for number, camera in enumerate(views.distinct):
-                rows = ((index == number) & moves.squeeze(-1).cpu()).nonzero().squeeze(-1)
-                if not len(rows):
-                    continue
+            images = samples[image_key(name)].clone()
+            for camera, rows in views.rows(texts):
+                rows = rows[(move[rows] != 0).any(-1).cpu()]
                 at, by = place[rows].to(images.device), move[rows].to(images.device)
-                seen = plane(images[rows], camera, at[:, 2])
+                seen = plane(camera, images.shape[-2:], at[:, 2])
                 part = self._part((seen[..., :2] - (at[:, :2] + by)[:, None, None]).norm(dim=-1))
                 images[rows] = warped(images[rows], camera, seen - F.pad(part[..., None] * by[:, None, None], (0, 1)))
                 if name == self._first:

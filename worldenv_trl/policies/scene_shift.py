@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -61,10 +61,7 @@ class SceneShift:
         share: float = 0.7,
         height: float | Mapping[str, float] = 0.03,
     ) -> None:
-        if not 0 <= reach < math.inf:
-            raise ValueError(f"reach must be at least 0 m, got {reach}")
-        if not 0 <= share <= 1:
-            raise ValueError(f"share must lie between 0 and 1, got {share}")
+        check_moves(reach, share)
         plain = plain_cameras(cameras)
         check_instructions(plain, "SceneShift")
         self._views = {name: Calibrations(each) for name, each in plain.items()}
@@ -77,9 +74,7 @@ class SceneShift:
             KeyError: if the image of a camera is missing, or an instruction's height.
         """
         out, state = samples.copy(), samples[STATE].clone()
-        # One call draws both, so that processes that share a batch agree on the numbers of each row.
-        drawn = own_rows(lambda rows: torch.rand(rows, 3), len(samples)).to(state.device)
-        move = (2 * drawn[:, :2] - 1) * self.reach * (drawn[:, 2:] < self.share)
+        move = draw_moves(len(samples), self.reach, self.share).to(state.device)
         state[:, :2] += move
         out[STATE] = state
         if WAYPOINT in samples.keys(include_nested=True):
@@ -88,25 +83,35 @@ class SceneShift:
         heights = [self.height[text] if isinstance(self.height, Mapping) else self.height for text in texts]
         height = torch.tensor(heights, dtype=state.dtype, device=state.device)
         for name, views in self._views.items():
-            index, images = views.indices(texts), samples[image_key(name)].clone()
+            images = samples[image_key(name)].clone()
             height, move = height.to(images.device), move.to(images.device)
-            for number, camera in enumerate(views.distinct):
-                rows = (index == number).nonzero().squeeze(-1).to(images.device)
-                if len(rows) and camera.mount == "world":
-                    images[rows] = _moved(images[rows], camera, height[rows], move[rows])
+            for camera, rows in views.rows(texts):
+                if camera.mount == "world":
+                    # A pixel shows the point of the plane that it now sees, where that point was before.
+                    seen = plane(camera, images.shape[-2:], height[rows])
+                    images[rows] = warped(images[rows], camera, seen - F.pad(move[rows], (0, 1))[:, None, None])
             out[image_key(name)] = images
         return out
 
 
-def _moved(images: Tensor, camera: Camera, height: Tensor, move: Tensor) -> Tensor:
-    """Images uint8 [n, 3, H, W] of ``camera`` when what lies at ``height`` [n] (m) has moved by ``move`` [n, 2] (m)."""
-    # A pixel shows the point of the plane that it now sees, where that point was before: backward warping.
-    return warped(images, camera, plane(images, camera, height) - F.pad(move, (0, 1))[:, None, None])
+def check_moves(reach: float, share: float) -> None:
+    """Raises ``ValueError`` unless samples can be moved so far (m), and so many of them."""
+    if not 0 <= reach < math.inf:
+        raise ValueError(f"reach must be at least 0 m, got {reach}")
+    if not 0 <= share <= 1:
+        raise ValueError(f"share must lie between 0 and 1, got {share}")
 
 
-def plane(images: Tensor, camera: Camera, height: Tensor) -> Tensor:
-    """Where the ray of each pixel of images [n, 3, H, W] meets the level plane at ``height`` [n] (m): [n, H, W, 3]."""
-    (rows, columns), device = images.shape[-2:], images.device
+def draw_moves(count: int, reach: float, share: float) -> Tensor:
+    """[count, 2]: uniform up to ``reach`` along either axis for a ``share`` of the rows, zero for the others."""
+    # One call draws both, so that processes that share a batch agree on the numbers of each row.
+    drawn = own_rows(lambda rows: torch.rand(rows, 3), count)
+    return (2 * drawn[:, :2] - 1) * reach * (drawn[:, 2:] < share)
+
+
+def plane(camera: Camera, size: Sequence[int], height: Tensor) -> Tensor:
+    """Where the rays of an image's pixels, ``size`` (H, W), meet level planes at ``height`` [n] (m): [n, H, W, 3]."""
+    (rows, columns), device = size, height.device
     position, rotation, focal = _pose(camera, rows, device)
     side_down = torch.arange(rows, device=device) + 0.5 - rows / 2
     side_right = torch.arange(columns, device=device) + 0.5 - columns / 2
