@@ -52,8 +52,8 @@ def decisions(actor) -> TensorDict:
     return td
 
 
-def train(loss, td, name: str, parameters, steps: int = 40) -> tuple[float, float]:
-    optimizer = torch.optim.Adam(parameters, 3e-3)
+def train(loss, td, name: str, parameters, steps: int = 40, learning_rate: float = 3e-3) -> tuple[float, float]:
+    optimizer = torch.optim.Adam(parameters, learning_rate)
     values = []
     for _ in range(steps):
         optimizer.zero_grad()
@@ -87,8 +87,10 @@ def test_the_three_stages_of_training_each_lower_their_loss_and_touch_only_their
     actor = laplace_actor(policy, log_scale_bounds=scale_bounds(policy))
     batch, loss = decisions(actor), LOOPLoss(actor, clip_epsilon=0.2, functional=False)
     assert loss(batch)["kl_approx"] < 1e-6  # the adapters change nothing yet
-    first, last = train(loss, batch, "loss_objective", [p for p in policy.parameters() if p.requires_grad], steps=10)
-    assert last < first
+    updated = [p for p in policy.parameters() if p.requires_grad]
+    # at 3e-3 ten steps go 3 to 12 nats away, and past the optimum, whatever the policy
+    first, last = train(loss, batch, "loss_objective", updated, steps=10, learning_rate=3e-4)
+    assert last < first / 2
     for name, parameter in policy.named_parameters():
         assert name not in frozen or torch.equal(parameter, frozen[name])
 
