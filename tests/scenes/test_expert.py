@@ -147,6 +147,20 @@ def test_a_task_that_is_none_is_refused(task, error, message):
         ScriptedExpert(task)
 
 
+def test_before_a_lever_at_the_bounds_of_the_workspace_the_hand_does_not_wait():
+    # a policy that sees only now cannot learn when to go on from a place where nothing changes
+    scene = _scene("goal/turn_on_the_stove", 20)
+    expert, done, resting = ScriptedExpert(scene.task), np.zeros(20, bool), np.zeros(20, int)
+    before = scene.measured_state()[:, :3].copy()
+    for _ in range(30):
+        scene.step(expert(scene))
+        now = scene.measured_state()[:, :3].copy()
+        resting = np.where((np.abs(now - before).max(1) < 0.002) & ~done, resting + 1, 0)
+        assert resting.max() <= 2
+        before, done = now, done | scene.success()
+    assert done.all()
+
+
 FAR = """(define (problem study) (:domain robosuite) (:language turn on the stove)
   (:regions (place (:target desk) (:ranges ((RANGE)))))
   (:fixtures desk - study_table stove_1 - flat_stove) (:objects)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from worldenv_trl.keys import ACTION_DIM, POSITION_STEP, ROTATION_STEP
+from worldenv_trl.robot import panda
 from worldenv_trl.scenes import controller
 from worldenv_trl.scenes.catalogue import load_task
 from worldenv_trl.scenes.files import FileTask
@@ -93,7 +94,9 @@ class ScriptedExpert:
             if phase.yaw is not None:
                 self._yaw[rows] = nearest_yaw(phase.yaw(scene), self._yaw)[rows]
             goal = phase.target(scene, self._memory)
-            error = goal - targets[:, :3]
+            # Where it cannot get to, it goes as near as it can, and on: nothing that is seen would tell when to go on.
+            nearest = np.clip(goal, panda.WORKSPACE_LOW, panda.WORKSPACE_HIGH)
+            error = nearest - targets[:, :3]
             if phase.yaw is not None:  # no lower before the hand is turned: the palm is broad
                 turning = np.linalg.norm(self._turn(commanded), axis=-1) > _TURNED
                 error[turning, 2] = np.maximum(error[turning, 2], 0.0)
@@ -104,7 +107,7 @@ class ScriptedExpert:
                 fastest = np.minimum(np.minimum(fastest, ramp), np.maximum(_BRAKE * length, POSITION_STEP * _RAMP))
             step = error / POSITION_STEP * np.minimum(1.0, fastest / np.maximum(length, 1e-9))
             action[rows, :3], action[rows, 6] = step[rows], phase.gripper
-            arrived = rows & (np.linalg.norm(goal - position, axis=-1) < phase.tolerance)
+            arrived = rows & (np.linalg.norm(nearest - position, axis=-1) < phase.tolerance)
             if phase.yaw is not None:
                 arrived &= np.linalg.norm(self._turn(commanded), axis=-1) < _TURNED
             self._dwell[arrived] += 1
@@ -113,7 +116,7 @@ class ScriptedExpert:
             if index == len(self.phases) - 1:
                 ready = self._again(scene, rows, following)
             else:
-                self._note_misses(index, goal, ready & ~arrived)
+                self._note_misses(index, goal, ready)
                 following[ready] += 1
             if phase.still is not None:
                 lost = rows & ~phase.still(scene)
@@ -145,13 +148,13 @@ class ScriptedExpert:
         """``[n]``: what the phase's stage is for holds already."""
         return self._relations.evaluate(scene, *self._stages[bisect_right(self._ends, index)].aim)
 
-    def _note_misses(self, index: int, goal: np.ndarray, given_up: np.ndarray) -> None:
-        """Keeps where rows have ``given_up [n]`` a phase because its ``goal [n, 3]`` is out of the arm's reach.
+    def _note_misses(self, index: int, goal: np.ndarray, ended: np.ndarray) -> None:
+        """Keeps where rows have ``ended [n]`` a phase although its ``goal [n, 3]`` is out of the arm's reach.
 
         In the first attempt only: in a later one things may lie where the hand has pushed them.
         """
-        if given_up.any():
-            missed = given_up & ~self._failed & (out_of_reach(goal) > self.phases[index].tolerance)
+        if ended.any():
+            missed = ended & ~self._failed & (out_of_reach(goal) > self.phases[index].tolerance)
             self._missed[missed, bisect_right(self._ends, index)] = goal[missed]
 
     def _say_why(self, stage: int, failed: np.ndarray) -> None:
