@@ -125,6 +125,8 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             f"sft.place_shift_m must lie between 0 and {_FARTHEST_PLACE_M} (m), got {config.sft.place_shift_m}: moved "
             "further, what is around folds over itself"
         )
+    if not 0 <= config.sft.decision_share <= 1:
+        raise ValueError(f"sft.decision_share must lie between 0 and 1, got {config.sft.decision_share}")
     if not 0 <= config.sft.aim_weight < float("inf"):
         raise ValueError(f"sft.aim_weight must be at least 0, got {config.sft.aim_weight}")
     if config.sft.aim_weight and config.sft.shift_px:

@@ -56,12 +56,17 @@ class SFT:
     """Largest distance by which a sample's scene and hand are moved over the table together, along each of its axes:
     demonstrations in places where none was given (``policies.SceneShift``). Before the shift above."""
     place_shift_m: float = 0.0
-    """Largest distance by which what lies where the gripper next closes or opens is moved, and the actions with it,
-    along each of the table's axes: the policy has to look where the thing is (``policies.PlaceShift``)."""
+    """Largest distance by which what lies where the gripper next closes or opens, or puts what it holds, is moved and
+    the actions with it, along each of the table's axes: the policy has to look where that is (``policies.PlaceShift``).
+    """
     aim_weight: float = 0.0
     """Of a second lesson, beside the actions: where on the image the gripper next closes or opens
     (``objectives.AimedCloning``). For policies that aim, others learn their actions alone; without the random shift
     above."""
+    decision_share: float = 0.0
+    """Share of each batch that comes from where whole chunks of an episode begin, its first step above all: there a
+    rollout decides, and of a demonstration's steps only one of ``chunk_length`` is such a place. The rest is drawn from
+    all steps alike."""
     cameras: tuple[str, ...] = ()
     """Cameras that the policy looks through, of the run's; all of them when empty. World model and reflector may see
     more than it does."""

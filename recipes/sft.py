@@ -137,6 +137,15 @@ def _lowest(samples: TensorDictBase) -> dict[str, float]:
     return lowest
 
 
+def _draws(samples: TensorDictBase, chunk_length: int, share: float) -> Callable[[int], torch.Tensor]:
+    """What draws numbers of samples for a batch: ``share`` of them from where whole chunks begin, else from all."""
+    decides = samples[keys.NUM_STEPS].squeeze(-1) % chunk_length == 0
+    weights = share * decides / decides.sum() + (1 - share) / len(samples)
+    if share == 0:
+        return lambda count: torch.randint(len(samples), (count,))
+    return lambda count: torch.multinomial(weights, count, replacement=True)
+
+
 def _train(
     policy: Policy,
     make_loss: Callable[[Any], torch.nn.Module],
@@ -156,6 +165,7 @@ def _train(
         shifts.append(PlaceShift(_seen(run), settings.place_shift_m))
     if settings.scene_shift_m:
         shifts.append(SceneShift(_seen(run), settings.scene_shift_m, height=_lowest(samples)))
+    draw = _draws(samples, run.config.chunk_length, settings.decision_share)
     optimizer = torch.optim.AdamW(parameters, lr=lr, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
@@ -164,8 +174,7 @@ def _train(
     progress = Resumable(run, name, steps, **state).bar(f"sft {name}")
     for step in progress:
         with processes.sharing():
-            chosen = own_rows(lambda count: torch.randint(len(samples), (count,)), rows)
-            batch = to_device(samples[chosen], run.device)
+            batch = to_device(samples[own_rows(draw, rows)], run.device)
             for shift in shifts:
                 batch = shift(batch)
             for image in images:

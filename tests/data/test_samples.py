@@ -74,5 +74,19 @@ def test_the_approach_is_shared_out_by_how_far_each_action_goes_over_the_table()
     episodes["actions"][0, :3, :2] = torch.tensor([[0.3, 0.4], [0.0, 0.2], [0.0, 0.0]])
     approach = policy_samples(episodes, chunk_length=2)[keys.APPROACH]
     told = [0.55, 0.25, 0.05]  # lengths, and .05 for every step
-    expected = [[told[0] / 0.85, told[1] / 0.85], [told[1] / 0.3, told[2] / 0.3], [1.0, 0.0], *[[0.0, 0.0]] * 3]
-    torch.testing.assert_close(approach, torch.tensor(expected))
+    expected = [[told[0] / 0.85, told[1] / 0.85], [told[1] / 0.3, told[2] / 0.3], [1.0, 0.0]]
+    put = [[1 / 3, 1 / 3], [1 / 2, 1 / 2], [1.0, 0.0]]  # from 3 on it holds something: the end is where that is put
+    torch.testing.assert_close(approach, torch.tensor(expected + put))
+
+
+def test_what_is_neither_to_be_taken_nor_held_has_no_approach():
+    episodes = make_episodes([4, 4, 5])
+    episodes["actions"][..., -1] = torch.tensor([1.0, -1.0, -1.0])[:, None]  # always closed, always open
+    episodes["actions"][2, :2, -1] = 1.0  # closed from the start, as for a drawer's handle, and open from 2 on
+    ahead = policy_samples(episodes, chunk_length=2)[keys.APPROACH].sum(1) > 0
+    assert ahead.tolist() == [False] * 8 + [True, True, False, False, False]
+
+
+def test_a_sample_says_how_many_steps_were_executed_before_it():
+    samples = policy_samples(make_episodes([3, 5]), chunk_length=4)
+    assert samples[keys.NUM_STEPS].tolist() == [[0], [1], [2], [0], [1], [2], [3], [4]]

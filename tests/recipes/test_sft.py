@@ -95,3 +95,17 @@ def test_places_are_moved_before_the_scene(run, monkeypatch):
     both = dataclasses.replace(run.config.sft, place_shift_m=0.02, steps=1)
     sft.fine_tune(dataclasses.replace(run, config=dataclasses.replace(run.config, sft=both)))
     assert order == [("PlaceShift", 0.02), ("SceneShift", 0.05)] * 2  # the means' lesson, then the scale's
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_share_of_each_batch_comes_from_where_chunks_begin(run, monkeypatch, share):
+    drawn = []
+    monkeypatch.setattr(sft, "SceneShift", lambda *_, **__: lambda samples: drawn.append(samples) or samples)
+    settings = dataclasses.replace(run.config.sft, decision_share=share, steps=40, batch_size=64)
+    sft.fine_tune(dataclasses.replace(run, config=dataclasses.replace(run.config, sft=settings)))
+    steps = torch.cat([samples[keys.NUM_STEPS] for samples in drawn]).squeeze(-1)
+    every = policy_samples(demonstrations(run))[keys.NUM_STEPS].squeeze(-1)
+    begins = (every % run.config.chunk_length == 0).float().mean()
+    expected = share + (1 - share) * begins
+    spread = (expected * (1 - expected) / len(steps)).sqrt()
+    assert ((steps % run.config.chunk_length == 0).float().mean() - expected).abs() <= 4 * spread

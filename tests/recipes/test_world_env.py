@@ -78,6 +78,7 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"evaluate": Evaluate(num_envs=0)}, "evaluate.num_envs must be at least 1"),
         ({"reflector": Reflector(threshold=1.5)}, r"reflector.threshold must be in \(0, 1\), got 1.5"),
         ({"sft": SFT(place_shift_m=0.06)}, "sft.place_shift_m must lie between 0 and 0.035 .*, got 0.06"),
+        ({"sft": SFT(decision_share=1.1)}, "sft.decision_share must lie between 0 and 1, got 1.1"),
         ({"sft": SFT(aim_weight=-1.0)}, "sft.aim_weight must be at least 0, got -1"),
         ({"sft": SFT(aim_weight=0.5)}, "sft.aim_weight needs sft.shift_px 0, got 2"),
         ({"sft": SFT(scene_shift_m=0.3)}, "sft.scene_shift_m must lie between 0 and 0.2 .*, got 0.3"),

@@ -7,7 +7,17 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 
 from worldenv_trl.data.episodes import Episodes
-from worldenv_trl.keys import ACTION_IS_PAD, APPROACH, CHUNK, CHUNK_LENGTH, INSTRUCTION, STATE, WAYPOINT, image_key
+from worldenv_trl.keys import (
+    ACTION_IS_PAD,
+    APPROACH,
+    CHUNK,
+    CHUNK_LENGTH,
+    INSTRUCTION,
+    NUM_STEPS,
+    STATE,
+    WAYPOINT,
+    image_key,
+)
 from worldenv_trl.row_texts import row_texts
 
 __all__ = ["policy_samples"]
@@ -19,12 +29,13 @@ def policy_samples(episodes: Episodes, chunk_length: int = CHUNK_LENGTH) -> Tens
     """One sample for each executed step of ``episodes``.
 
     Returns a TensorDict [N], episode after episode: ``("observation", ...)`` uint8 [N, 3, H, W] of every camera,
-    ``("observation", "state")`` [N, 7], ``language_instruction``, ``("vla_action", "chunk")`` [N, C, 7] with the
-    actions from this step on, ``action_is_pad`` bool [N, C], True past the end of the episode, where the last
-    action repeats, and ``("vla_action", "waypoint")`` [N, 3], the hand's position (m) when the gripper is next told to
-    close or to open, or at the end: where things are taken hold of and let go (keyframes of C2F-ARM, arXiv:2106.12534).
-    ``("vla_action", "approach")`` [N, C] is the share of the way over the table to there, from this step on, that each
-    action goes; 0 where the episode ends without another change.
+    ``("observation", "state")`` [N, 7], ``language_instruction``, ``num_steps`` [N, 1], those executed before this one,
+    ``("vla_action", "chunk")`` [N, C, 7] with the actions from this step on, ``action_is_pad`` bool [N, C], True past
+    the end of the episode, where the last action repeats, and ``("vla_action", "waypoint")`` [N, 3], the hand's
+    position (m) when the gripper is next told to close or to open, or at the end: where things are taken hold of and
+    let go (keyframes of C2F-ARM, arXiv:2106.12534). ``("vla_action", "approach")`` [N, C] is the share of the way over
+    the table to there, from this step on, that each action goes; 0 where the episode ends without another change,
+    unless something is held: then its end is where that is put.
 
     Raises:
         ValueError: for a chunk shorter than one step, or episodes in which nothing was executed.
@@ -39,18 +50,25 @@ def policy_samples(episodes: Episodes, chunk_length: int = CHUNK_LENGTH) -> Tens
     wanted = step.unsqueeze(-1) + torch.arange(chunk_length, device=step.device)  # [N, C]
     end = length[episode]
     chunk = episodes["actions"][episode.unsqueeze(-1), torch.minimum(wanted, end - 1)]
-    out = TensorDict({STATE: episodes["states"][episode, step]}, batch_size=[len(episode)])
+    out = TensorDict({STATE: episodes["states"][episode, step], NUM_STEPS: step[:, None]}, batch_size=[len(episode)])
     for camera in episodes.cameras:
         out[image_key(camera)] = episodes.frames(camera, episode, step)
     out.set(INSTRUCTION, row_texts([episodes.instructions[row] for row in episode.tolist()]))
     out[CHUNK], out[ACTION_IS_PAD] = chunk, wanted >= end
     change = _next_change(episodes)[episode, step]
     out[WAYPOINT] = episodes["states"][episode, change, :3]
-    ahead = (wanted < change.unsqueeze(-1)) & (change.unsqueeze(-1) < end)
+    goes = (change.unsqueeze(-1) < end) | _holding(episodes)[episode, step].unsqueeze(-1)
+    ahead = (wanted < change.unsqueeze(-1)) & goes
     way = _way(episodes)
     at = way[episode.unsqueeze(-1), torch.cat([wanted, wanted[:, -1:] + 1], 1).minimum(end)]  # [N, C + 1]
     out[APPROACH] = ahead * at.diff(dim=1) / (way[episode, change] - way[episode, step]).unsqueeze(-1)
     return out
+
+
+def _holding(episodes: Episodes) -> torch.Tensor:
+    """bool [R, T]: the gripper has closed in this episode and is told to stay closed: it carries something."""
+    closing = episodes["actions"][..., -1] > 0
+    return closing & (~closing).cummax(1).values
 
 
 def _way(episodes: Episodes) -> torch.Tensor:

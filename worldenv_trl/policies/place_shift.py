@@ -1,4 +1,4 @@
-"""Demonstrations with the thing somewhere else: what lies around the next grasp moved, and the actions with it."""
+"""Demonstrations with the thing, or its place, somewhere else: what lies there is moved, and the actions with it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STEEPEST = 1.5  # slope of the smooth step between the radii, times their dista
 
 
 class PlaceShift:
-    """Moves what lies around the place where the gripper next closes or opens, each sample by a distance of its own.
+    """Moves what lies where the gripper next closes or opens, or puts what it holds, each sample by its own distance.
 
     The rest of the image stays, the actions bring the hand to where the thing is now, and nothing but the thing tells
     where that is. Of five demonstrations a policy learns otherwise to replay one after seeing which of them it
