@@ -319,6 +319,7 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
                 scene_shift_m=0.025,
                 place_shift_m=0.025,
                 aim_weight=0.5,
+                decision_share=0.5,
                 vision_blocks=(2, 4, 10),
             ),
             explore=Explore(episodes_per_task=480),
