@@ -139,10 +139,10 @@ def _lowest(samples: TensorDictBase) -> dict[str, float]:
 
 def _draws(samples: TensorDictBase, chunk_length: int, share: float) -> Callable[[int], torch.Tensor]:
     """What draws numbers of samples for a batch: ``share`` of them from where whole chunks begin, else from all."""
-    decides = samples[keys.NUM_STEPS].squeeze(-1) % chunk_length == 0
-    weights = share * decides / decides.sum() + (1 - share) / len(samples)
     if share == 0:
         return lambda count: torch.randint(len(samples), (count,))
+    decides = samples[keys.NUM_STEPS].squeeze(-1) % chunk_length == 0
+    weights = share * decides / decides.sum() + (1 - share) / len(samples)
     return lambda count: torch.multinomial(weights, count, replacement=True)
 
 

@@ -66,7 +66,7 @@ def policy_samples(episodes: Episodes, chunk_length: int = CHUNK_LENGTH) -> Tens
 
 
 def _holding(episodes: Episodes) -> torch.Tensor:
-    """bool [R, T]: the gripper has closed in this episode and is told to stay closed: it carries something."""
+    """bool [R, T]: the gripper has closed in this episode and is told to stay so: it carries or pushes something."""
     closing = episodes["actions"][..., -1] > 0
     return closing & (~closing).cummax(1).values
 
