@@ -22,7 +22,7 @@ from worldenv_trl.scenes.files import FileTask
 from worldenv_trl.scenes.plan import plan_stages
 from worldenv_trl.scenes.reach import out_of_reach
 from worldenv_trl.scenes.settings import setting_of
-from worldenv_trl.scenes.skills.phase import nearest_yaw
+from worldenv_trl.scenes.skills.phase import wrist_yaw
 from worldenv_trl.scenes.tasks import Task
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class ScriptedExpert:
                 if fresh.any():
                     self._memory[fresh] = phase.remember(scene)[fresh]
             if phase.yaw is not None:
-                self._yaw[rows] = nearest_yaw(phase.yaw(scene), self._yaw)[rows]
+                self._yaw[rows] = wrist_yaw(phase.yaw(scene), self._yaw)[rows]
             goal = phase.target(scene, self._memory)
             # Where it cannot get to, it goes as near as it can, and on: nothing that is seen would tell when to go on.
             nearest = np.clip(goal, panda.WORKSPACE_LOW, panda.WORKSPACE_HIGH)

@@ -23,7 +23,7 @@ from worldenv_trl.scenes.simulation import SceneBatch, home_state
 if TYPE_CHECKING:
     from worldenv_trl.scenes.files import FileTask
 
-__all__ = ["Check", "draw_poses", "load_poses", "save_poses", "states_from_poses", "stored_seed"]
+__all__ = ["Check", "draw_poses", "drawn_scene", "load_poses", "save_poses", "states_from_poses", "stored_seed"]
 
 Check = Callable[[np.ndarray], np.ndarray]
 """Which of the integration states ``[n, S]`` may be kept, ``[n]`` bool: those that an expert solves, say."""
@@ -60,13 +60,9 @@ def _draw(task: FileTask, split: str, start: int, count: int, check: Check | Non
             # One generator per state and attempt: a larger count extends a smaller one.
             rng = np.random.default_rng([seed, SPLITS.index(split), start + int(index), attempt])
             data.qpos[:] = qpos
-            task.layout.draw(data, rng)
-            mujoco.mj_kinematics(model, data)
+            _lay_out(task, scene, int(index), data, rng)
             drawn[row] = data.xpos[things]
-            for name, value in (
-                ("qpos", data.qpos), ("qvel", 0.0), ("mocap_pos", data.mocap_pos), ("mocap_quat", data.mocap_quat),
-                ("ctrl", ctrl), ("userdata", targets), ("qacc_warmstart", 0.0),
-            ):  # fmt: skip
+            for name, value in (("qvel", 0.0), ("ctrl", ctrl), ("userdata", targets), ("qacc_warmstart", 0.0)):
                 bind(name)[index] = value
         scene.batch.step(waiting, nstep=_SETTLE_SUBSTEPS)
         scene.batch.forward(waiting, stage=mujoco.mjtStage.mjSTAGE_POS.value)
@@ -93,6 +89,28 @@ def _draw(task: FileTask, split: str, start: int, count: int, check: Check | Non
         f"{task.name}: {split} initial state {start + int(waiting[0])} does not come to rest in {_ATTEMPTS} tries: "
         "something falls, is pushed away from its region in :init, or fulfils the goal at once"
     )
+
+
+def drawn_scene(task: FileTask, count: int) -> SceneBatch:
+    """A scene of ``count`` layouts such as initial states are drawn from: nothing has come to rest yet.
+
+    Raises:
+        RuntimeError: if things cannot be placed clear of each other.
+    """
+    scene, data = SceneBatch(task, count, cameras=()), mujoco.MjData(task.build())
+    rng = np.random.default_rng(task.seed)
+    for row in range(count):
+        _lay_out(task, scene, row, data, rng)
+    scene.batch.forward(np.arange(count, dtype=np.int32), stage=mujoco.mjtStage.mjSTAGE_POS.value)
+    return scene
+
+
+def _lay_out(task: FileTask, scene: SceneBatch, row: int, data: mujoco.MjData, rng: np.random.Generator) -> None:
+    """Draws a layout into ``data`` and into a row of the scene."""
+    task.layout.draw(data, rng)
+    mujoco.mj_kinematics(scene.model, data)
+    for name in ("qpos", "mocap_pos", "mocap_quat"):
+        scene.batch.bind(name)[row] = getattr(data, name)
 
 
 def states_from_poses(task: FileTask, poses: np.ndarray) -> np.ndarray:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from worldenv_trl.robot import panda
 from worldenv_trl.scenes.entities import Primitive
-from worldenv_trl.scenes.skills.phase import FINGERTIP, axes, body, tcp
+from worldenv_trl.scenes.skills.phase import FINGER_HALF, FINGERTIP, axes, body, tcp
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.files import FileTask
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 MARGIN = 0.025  # between what moves and what it moves over
 _HAND = 0.08  # kept free on both sides of the hand's path
+_PALM_HALF = 0.022  # its thickness
 _PALM_ABOVE = 0.037  # underside of the palm over the point between the fingertips
 _FINGERS, _PALM = (0.0, 0.03, 0.055), (-0.10, -0.05, 0.05, 0.10)  # points along the fingers' axis that must be free
 _CEILING = panda.WORKSPACE_HIGH[2] - 0.01
@@ -73,11 +75,12 @@ def room(
 ) -> np.ndarray:
     """``[n]`` metres around a hand at ``grip [n, 3]`` whose fingers open along ``direction [n, 2]``, at most 2 cm."""
     free = np.full(len(grip), _FREE)
+    across = np.stack([-direction[:, 1], direction[:, 0]], -1)
     for center, turned, half, top in _obstacles(scene, entities, without):
-        for offsets, rise in ((_FINGERS, -FINGERTIP), (_PALM, _PALM_ABOVE)):
+        for offsets, side, rise in ((_FINGERS, FINGER_HALF, -FINGERTIP), (_PALM, _PALM_HALF, _PALM_ABOVE)):
             blocks = top > grip[:, 2] + rise
-            for offset in offsets:
-                points = grip[:, :2] + offset * direction - center[:, :2]
+            for along, aside in product(offsets, (-side, 0.0, side)):
+                points = grip[:, :2] + along * direction + aside * across - center[:, :2]
                 local = np.abs(np.einsum("nji,nj->ni", turned[:, :2, :2], points)) - half[:2]
                 gap = np.linalg.norm(np.maximum(local, 0.0), axis=-1) + np.minimum(local.max(-1), 0.0)
                 free = np.where(blocks, np.minimum(free, gap), free)

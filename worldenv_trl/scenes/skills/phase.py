@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 OPEN, CLOSE = -1.0, 1.0
 FINGER_HALF = 0.0105  # half the fingers' thickness along the hand's x axis, m
-_WRIST = 1.9  # rad either way
+_MIDDLE, _KEPT = np.pi / 4, 0.3  # rad: of the wrist's range; how near to its yaw the hand is left in peace
 FINGERTIP = 0.0075  # how far they reach below the point between them
 
 
@@ -75,7 +75,12 @@ def half_turn(angle: np.ndarray) -> np.ndarray:
     return (angle + np.pi / 2 - 1e-6) % np.pi - np.pi / 2 + 1e-6
 
 
-def nearest_yaw(wanted: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """Of the yaws that put the fingers along the same line, the one nearest to ``now`` that the wrist can reach."""
-    turned = now + half_turn(wanted - now)
-    return np.where(np.abs(turned) < _WRIST, turned, half_turn(turned))
+def wrist_yaw(wanted: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """Of the yaws that put the fingers along the same line, the one in the middle of the wrist's range.
+
+    So the hand turns the same way for all things that lie alike, and things mostly lie along the table or across it:
+    the nearest to home would be this way for half of those that lie across, that way for the others. A yaw that the
+    hand has but for a little it keeps.
+    """
+    kept = now + half_turn(wanted - now)
+    return np.where(np.abs(kept - now) < _KEPT, kept, _MIDDLE + half_turn(wanted - _MIDDLE))

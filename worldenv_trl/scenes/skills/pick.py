@@ -7,19 +7,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldenv_trl.robot import panda
-from worldenv_trl.scenes.entities.base import Grasp
 from worldenv_trl.scenes.files import FileTask
 from worldenv_trl.scenes.relations import inside
-from worldenv_trl.scenes.skills.clearance import room, travel
-from worldenv_trl.scenes.skills.phase import CLOSE, OPEN, Phase, axes, body, half_turn, tcp
+from worldenv_trl.scenes.skills.clearance import travel
+from worldenv_trl.scenes.skills.grips import grips
+from worldenv_trl.scenes.skills.phase import CLOSE, OPEN, Phase, axes, body, tcp
 
 if TYPE_CHECKING:
     from worldenv_trl.scenes.simulation import SceneBatch
 
 _HOVER = 0.07  # above what is gripped, before the hand goes down
 _CLEAR = 0.05  # between the bottom of what is carried and its place, before it goes down
-_REACH = 0.78  # from the base, m; a hand that points down reaches little further
 
 
 def pick_and_place(
@@ -40,10 +38,10 @@ def pick_and_place(
     into = bool(part) and owner in entities and not entities[owner].regions[part].on_top
 
     def grip(scene: SceneBatch, height: float = 0.0) -> np.ndarray:
-        return _grip(scene, task, thing, grasp)[0] + (0.0, 0.0, height)
+        return grips(scene, task, thing)[0] + (0.0, 0.0, height)
 
     def yaw(scene: SceneBatch) -> np.ndarray:
-        return _grip(scene, task, thing, grasp)[1]
+        return grips(scene, task, thing)[1]
 
     def goal(scene: SceneBatch) -> np.ndarray:
         """Where the thing's origin should come to rest."""
@@ -94,40 +92,3 @@ def pick_and_place(
         Phase(lambda s, m: m, OPEN, tolerance=0.02, remember=lambda s: np.add(tcp(s), (0, 0, 0.09)), still=placed),
     ]
     return [replace(phase, again=again) for phase in phases]
-
-
-def _ways(scene: SceneBatch, thing: str, grasp: Grasp) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Ways to grip a thing, best first: where ``[n, 3]``, and the hand's yaw ``[n]``."""
-    origin, turned = body(scene, thing), axes(scene, thing)
-    x, y, z = grasp.offset
-    heading = np.arctan2(turned[:, 1, 0], turned[:, 0, 0])
-    level = np.zeros_like(heading)
-    if grasp.kind == "rim":
-        offsets = ((0.0, y, 0.0), (0.0, -y, 0.0), (-y, 0.0, 0.0), (y, 0.0, 0.0))
-        yaws = (level, level, level + np.pi / 2, level + np.pi / 2)
-        return [(origin + np.add(offset, (0, 0, z)), yaw) for offset, yaw in zip(offsets, yaws, strict=True)]
-    point = origin + turned @ np.array((x, y, 0.0)) + (0.0, 0.0, z)
-    if grasp.kind == "round":
-        return [(point, level + yaw) for yaw in (0.0, np.pi / 4, -np.pi / 4, np.pi / 2)]
-    if grasp.kind == "square":
-        return [(point, half_turn(heading)), (point, half_turn(heading + np.pi / 2))]
-    return [(point, half_turn(heading))]
-
-
-def _grip(scene: SceneBatch, task: FileTask, thing: str, grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
-    """The way with the most room around the hand: where ``[n, 3]``, and yaw ``[n]``."""
-    ways = _ways(scene, thing, grasp)
-    if len(ways) == 1:
-        return ways[0]
-    rooms = []
-    for order, (point, yaw) in enumerate(ways):
-        direction = np.stack([-np.sin(yaw), np.cos(yaw)], -1)
-        if grasp.kind == "rim":  # the outer finger is the one that needs room
-            direction = (point - body(scene, thing))[:, :2] / grasp.offset[1]
-        free = room(scene, task.entities, point, direction, (thing,))
-        far = np.linalg.norm(point[:, :2] - panda.BASE_POSITION[:2], axis=-1) - _REACH
-        rooms.append(free - np.maximum(far, 0.0) - 0.002 * order)
-    best = np.argmax(rooms, 0)
-    points, yaws = np.stack([way[0] for way in ways]), np.stack([way[1] for way in ways])
-    rows = np.arange(len(best))
-    return points[best, rows], yaws[best, rows]
