@@ -20,7 +20,7 @@ def _scene(name: str, rows: int = ROWS) -> SceneBatch:
 
 def _side(scene: SceneBatch) -> np.ndarray:
     """Direction from the bowl's middle to where it is taken, in whole quarter turns, ``[n]``."""
-    point, yaw = grips(scene, scene.task, BOWL)
+    point, yaw = grips(scene, scene.task, BOWL, scene.task.entities[BOWL].grasp)
     x, y = (point - scene.xpos[:, scene.model.body(f"{BOWL}/").id])[:, :2].T
     across = np.abs(np.stack([np.cos(yaw), np.sin(yaw)]) * np.stack([x, y])).sum(0)
     np.testing.assert_allclose(across, 0.0, atol=1e-9)  # one finger inside the rim, one outside

@@ -26,19 +26,20 @@ _DRAWS = 64
 _TURN = 0.2  # a way that turns the hand takes longer and sweeps more: it is usual where so many more layouts allow it
 
 
-def grips(scene: SceneBatch, task: FileTask, thing: str) -> Grips:
-    """How to grip ``thing`` in each row: its task's usual way where there is room for it, else the next usual one.
+def grips(scene: SceneBatch, task: FileTask, thing: str, grasp: Grasp) -> Grips:
+    """How to grip ``thing`` in each row: the usual way of its task where there is room, else the next usual one.
 
-    Where none has room it is the way with the most. That two demonstrations of a task take a bowl by the same rim,
-    unless something stands there, is what makes them teach one thing.
+    Where no way has room it is the one with the most. So two demonstrations of a task take a bowl by the same rim,
+    unless something stands there, and teach the same.
+
+    Raises:
+        RuntimeError: if the task's things cannot be placed clear of each other.
     """
-    grasp = task.entities[thing].grasp
-    assert grasp is not None
     ways = _ways(scene, thing, grasp)
     if len(ways) == 1:
         return ways[0]
     rooms = _rooms(scene, task, thing, grasp, ways)
-    order = list(_usual(task, thing))
+    order = list(_usual(task, thing, grasp))
     enough = rooms[order] > _ENOUGH
     best = np.where(enough.any(0), np.array(order)[enough.argmax(0)], rooms.argmax(0))
     points, yaws = np.stack([way[0] for way in ways]), np.stack([way[1] for way in ways])
@@ -47,10 +48,9 @@ def grips(scene: SceneBatch, task: FileTask, thing: str) -> Grips:
 
 
 @cache
-def _usual(task: FileTask, thing: str) -> tuple[int, ...]:
+def _usual(task: FileTask, thing: str, grasp: Grasp) -> tuple[int, ...]:
     """The ways, the one first that has room in most of the layouts that the task draws; of equal ones the simplest."""
-    scene, grasp = drawn_scene(task, _DRAWS), task.entities[thing].grasp
-    assert grasp is not None
+    scene = drawn_scene(task, _DRAWS)
     ways = _ways(scene, thing, grasp)
     share = (_rooms(scene, task, thing, grasp, ways) > _ENOUGH).mean(1)
     turned = np.array([np.abs(yaw - ways[0][1]).max() > 0.1 for _, yaw in ways])

@@ -38,10 +38,10 @@ def pick_and_place(
     into = bool(part) and owner in entities and not entities[owner].regions[part].on_top
 
     def grip(scene: SceneBatch, height: float = 0.0) -> np.ndarray:
-        return grips(scene, task, thing)[0] + (0.0, 0.0, height)
+        return grips(scene, task, thing, grasp)[0] + (0.0, 0.0, height)
 
     def yaw(scene: SceneBatch) -> np.ndarray:
-        return grips(scene, task, thing)[1]
+        return grips(scene, task, thing, grasp)[1]
 
     def goal(scene: SceneBatch) -> np.ndarray:
         """Where the thing's origin should come to rest."""
