@@ -6,19 +6,22 @@ import numpy as np
 import pytest
 
 import init_states
-from worldenv_trl.scenes import load_task
+from worldenv_trl.scenes import SceneBatch, load_task
 from worldenv_trl.scenes.catalogue import SUITES_FOLDER
-from worldenv_trl.scenes.initial import draw_poses, load_poses, states_from_poses
+from worldenv_trl.scenes.initial import load_poses
 
-TASK = "goal/open_the_top_drawer_and_put_the_bowl_inside"
+TASK = "starter/put_the_bowl_on_the_plate"
 
 
-def test_a_bowl_between_bottle_and_drawer_is_refused_and_what_is_stored_instead_is_solved():
+def test_a_bowl_out_of_reach_is_refused_and_what_is_stored_is_solved():
     task = load_task(TASK)
-    first_draws = states_from_poses(task, draw_poses(task, "test", 31, 2))
-    stored = task.init_states("test")[31:33]
-    assert np.array_equal(first_draws[1], stored[1])
-    assert init_states.solved_by_expert(task, np.stack([first_draws[0], *stored])).tolist() == [False, True, True]
+    stored = task.init_states("test", 3)
+    scene = SceneBatch(task, 3, cameras=())
+    scene.reset(np.arange(3), stored)
+    bowl = scene.model.jnt_qposadr[scene.model.body("bowl_1/").jntadr[0]]
+    scene.qpos[1, bowl : bowl + 2] = 0.28, 0.34  # 94 cm from the base
+    assert init_states.solved_by_expert(task, scene.sim_state()).tolist() == [True, False, True]
+    assert init_states.solved_by_expert(task, stored).all()
 
 
 def test_states_of_one_s_own_file_are_stored_beside_it(tmp_path, capsys):
