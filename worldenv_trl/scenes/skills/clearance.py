@@ -18,9 +18,11 @@ if TYPE_CHECKING:
 
 MARGIN = 0.025  # between what moves and what it moves over
 _HAND = 0.08  # kept free on both sides of the hand's path
-_PALM_HALF = 0.022  # its thickness
 _PALM_ABOVE = 0.037  # underside of the palm over the point between the fingertips
-_FINGERS, _PALM = (0.0, 0.03, 0.055), (-0.10, -0.05, 0.05, 0.10)  # points along the fingers' axis that must be free
+_PALM_HALF = 0.022  # half its thickness
+# Points that must be free, along the fingers' axis and across it, [k, 2].
+_FINGERS = np.array(list(product((0.0, 0.03, 0.055), (-FINGER_HALF, 0.0, FINGER_HALF))))
+_PALM = np.array(list(product((-0.10, -0.05, 0.05, 0.10), (-_PALM_HALF, 0.0, _PALM_HALF))))
 _CEILING = panda.WORKSPACE_HIGH[2] - 0.01
 _RISE, _THERE = 0.02, 0.02  # sideways only this near to the height that it takes; down only this near to the end
 _FREE = 0.02  # more room than this is as good as this
@@ -75,15 +77,14 @@ def room(
 ) -> np.ndarray:
     """``[n]`` metres around a hand at ``grip [n, 3]`` whose fingers open along ``direction [n, 2]``, at most 2 cm."""
     free = np.full(len(grip), _FREE)
-    across = np.stack([-direction[:, 1], direction[:, 0]], -1)
+    hand = np.stack([direction, np.stack([-direction[:, 1], direction[:, 0]], -1)], 1)  # its axes, [n, 2, 2]
     for center, turned, half, top in _obstacles(scene, entities, without):
-        for offsets, side, rise in ((_FINGERS, FINGER_HALF, -FINGERTIP), (_PALM, _PALM_HALF, _PALM_ABOVE)):
-            blocks = top > grip[:, 2] + rise
-            for along, aside in product(offsets, (-side, 0.0, side)):
-                points = grip[:, :2] + along * direction + aside * across - center[:, :2]
-                local = np.abs(np.einsum("nji,nj->ni", turned[:, :2, :2], points)) - half[:2]
-                gap = np.linalg.norm(np.maximum(local, 0.0), axis=-1) + np.minimum(local.max(-1), 0.0)
-                free = np.where(blocks, np.minimum(free, gap), free)
+        inwards = hand @ turned[:, :2, :2]
+        middle = np.einsum("nji,nj->ni", turned[:, :2, :2], grip[:, :2] - center[:, :2])
+        for points, rise in ((_FINGERS, -FINGERTIP), (_PALM, _PALM_ABOVE)):
+            local = np.abs(middle[:, None] + points @ inwards) - half[:2]  # [n, k, 2]
+            gap = np.linalg.norm(np.maximum(local, 0.0), axis=-1) + np.minimum(local.max(-1), 0.0)
+            free = np.where(top > grip[:, 2] + rise, np.minimum(free, gap.min(-1)), free)
     return free
 
 
