@@ -25,6 +25,14 @@ def test_a_yaw_that_the_hand_nearly_has_is_kept_beyond_the_middle_of_its_range()
     )
 
 
+def test_a_hand_that_follows_a_line_all_the_way_round_stays_within_the_wrist():
+    yaw = np.zeros(1)
+    for wanted in np.linspace(0.0, 4 * np.pi, 200):
+        yaw = wrist_yaw(np.array([wanted]), yaw)
+        np.testing.assert_allclose(np.sin(yaw - wanted), 0.0, atol=1e-9)
+        assert -np.pi / 4 - 0.3 < yaw.item() < 3 * np.pi / 4 + 0.3
+
+
 @pytest.mark.parametrize(
     "name", ["goal/put_the_cream_cheese_in_the_bowl", "long/put_the_book_in_the_caddy_and_the_mug_on_the_plate"]
 )

@@ -76,11 +76,12 @@ def half_turn(angle: np.ndarray) -> np.ndarray:
 
 
 def wrist_yaw(wanted: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """Of the yaws that put the fingers along the same line, the one in the middle of the wrist's range.
+    """Of the yaws ``[n]`` (rad) that lay the fingers along ``wanted``, the one in the middle of the wrist's range.
 
     So the hand turns the same way for all things that lie alike, and things mostly lie along the table or across it:
     the nearest to home would be this way for half of those that lie across, that way for the others. A yaw that the
-    hand has but for a little it keeps.
+    hand has ``now`` but for a little it keeps, as far as the wrist goes.
     """
-    kept = now + half_turn(wanted - now)
-    return np.where(np.abs(kept - now) < _KEPT, kept, _MIDDLE + half_turn(wanted - _MIDDLE))
+    kept, middle = now + half_turn(wanted - now), _MIDDLE + half_turn(wanted - _MIDDLE)
+    near = (np.abs(kept - now) < _KEPT) & (np.abs(kept - _MIDDLE) < np.pi / 2 + _KEPT)
+    return np.where(near, kept, middle)
