@@ -61,6 +61,7 @@ def _draw(task: FileTask, split: str, start: int, count: int, check: Check | Non
             rng = np.random.default_rng([seed, SPLITS.index(split), start + int(index), attempt])
             data.qpos[:] = qpos
             _lay_out(task, scene, int(index), data, rng)
+            mujoco.mj_kinematics(model, data)
             drawn[row] = data.xpos[things]
             for name, value in (("qvel", 0.0), ("ctrl", ctrl), ("userdata", targets), ("qacc_warmstart", 0.0)):
                 bind(name)[index] = value
@@ -108,7 +109,6 @@ def drawn_scene(task: FileTask, count: int) -> SceneBatch:
 def _lay_out(task: FileTask, scene: SceneBatch, row: int, data: mujoco.MjData, rng: np.random.Generator) -> None:
     """Draws a layout into ``data`` and into a row of the scene."""
     task.layout.draw(data, rng)
-    mujoco.mj_kinematics(scene.model, data)
     for name in ("qpos", "mocap_pos", "mocap_quat"):
         scene.batch.bind(name)[row] = getattr(data, name)
 
