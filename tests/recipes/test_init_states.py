@@ -8,20 +8,24 @@ import pytest
 import init_states
 from worldenv_trl.scenes import SceneBatch, load_task
 from worldenv_trl.scenes.catalogue import SUITES_FOLDER
-from worldenv_trl.scenes.initial import load_poses
+from worldenv_trl.scenes.initial import draw_poses, load_poses, states_from_poses
 
-TASK = "starter/put_the_bowl_on_the_plate"
+TASK = "goal/open_the_top_drawer_and_put_the_bowl_inside"
 
 
 def test_a_bowl_out_of_reach_is_refused_and_what_is_stored_is_solved():
     task = load_task(TASK)
-    stored = task.init_states("test", 3)
-    scene = SceneBatch(task, 3, cameras=())
-    scene.reset(np.arange(3), stored)
+    first_draws = states_from_poses(task, draw_poses(task, "test", 31, 2))
+    stored = task.init_states("test")[31:33]
+    assert not np.array_equal(first_draws[0], stored[0])  # refused when they were made
+    assert np.array_equal(first_draws[1], stored[1])
+    scene = SceneBatch(task, 1, cameras=())
+    scene.reset(np.arange(1), first_draws[:1])
     bowl = scene.model.jnt_qposadr[scene.model.body("bowl_1/").jntadr[0]]
-    scene.qpos[1, bowl : bowl + 2] = 0.28, 0.34  # 94 cm from the base
-    assert init_states.solved_by_expert(task, scene.sim_state()).tolist() == [True, False, True]
-    assert init_states.solved_by_expert(task, stored).all()
+    scene.qpos[0, bowl : bowl + 2] = 0.28, 0.34  # 94 cm from the base
+    with pytest.warns(UserWarning, match="out of the arm's reach"):
+        solved = init_states.solved_by_expert(task, np.concatenate([scene.sim_state(), stored]))
+    assert solved.tolist() == [False, True, True]
 
 
 def test_states_of_one_s_own_file_are_stored_beside_it(tmp_path, capsys):
