@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 from torchrl.data import Unbounded
-from torchrl.envs.transforms import MultiAction, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs.transforms import MultiAction, RewardSum, StepCounter, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from worldenv_trl.envs import ExpertPolicy, TabletopEnv, chunked
@@ -230,3 +230,55 @@ def test_a_chunk_key_is_what_multi_action_reads():
     env = TransformedEnv(make(cameras=()), MultiAction.from_vla(stack_rewards=False))
     td = env.reset().set(CHUNK, torch.zeros(2, 3, 7))
     assert (env.step(td)["next", NUM_STEPS] == 3).all()
+
+
+class Watching(Transform):
+    """Looks at every image, as a reflector does."""
+
+    def __init__(self):
+        super().__init__(in_keys=[IMAGE])
+        self.seen = []
+
+    def _step(self, tensordict, next_tensordict):
+        self.seen.append(next_tensordict[IMAGE].clone())
+        return next_tensordict
+
+
+def test_images_inside_a_chunk_are_drawn_for_who_looks_at_them():
+    watching = Watching()
+    env = chunked(TransformedEnv(make(2), watching), C)
+    env.step(env.reset().set(CHUNK, plan(C, 2).transpose(0, 1)))
+    assert len(watching.seen) == C
+    assert all(not torch.equal(before, after) for before, after in zip(watching.seen, watching.seen[1:], strict=False))
+    env.close()
+
+
+@pytest.mark.parametrize("ends", ["together", "apart"])
+def test_only_the_last_image_of_a_chunk_is_drawn_and_it_is_right(ends, monkeypatch):
+    """Also of rows that end inside: where all do, and where one goes on."""
+    (plan_of_one, needed), same = expert_plan(1, 60), {"init_state_mode": "fixed"}
+    actions = plan_of_one.expand(-1, 2, -1).clone()
+    if ends == "apart":
+        actions[:, 1] = 0.1
+    length = int(needed) + 1  # one chunk, inside which a row ends
+    steps = make(2, **same)
+    td = steps.reset()
+    active = torch.ones(2, dtype=torch.bool)
+    for action in actions[:length]:
+        out = steps.step(td.set(ACTION, action).set("_step", active))["next"]
+        active = active & ~out["done"].squeeze(-1)
+        td = out.exclude("reward")
+        if not active.any():
+            break
+    drawn = []
+    pool = type(make(1)._pool)
+    start = pool.start
+    monkeypatch.setattr(pool, "start", lambda self, *rest: drawn.append(1) or start(self, *rest))
+    env = chunked(make(2, **same), length)
+    td = env.reset()
+    drawn.clear()
+    shown = env.step(td.set(CHUNK, actions[:length].transpose(0, 1)))["next"]
+    assert len(drawn) == 1
+    assert torch.equal(shown[IMAGE], out[IMAGE])
+    assert shown["done"].any() and shown["done"].all() == (ends == "together")
+    steps.close(), env.close()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Binary, Composite, Unbounded
@@ -56,6 +58,16 @@ def _parts(transform: Transform) -> list[Transform]:
     return list(transform) if isinstance(transform, Compose) else [transform]
 
 
+def _watched(env: EnvBase) -> bool:
+    """Whether a transform of the env looks at its images step by step."""
+    while isinstance(env, TransformedEnv):
+        keys = {key for part in _parts(env.transform) for key in part.in_keys}
+        if any(key == "observation" or key[0] == "observation" and key != STATE for key in keys):
+            return True
+        env = env.base_env
+    return False
+
+
 class ChunkedActions(MultiAction):
     """:class:`~torchrl.envs.transforms.MultiAction` for batch-locked VLA environments, with a fixed chunk length.
 
@@ -94,13 +106,15 @@ class ChunkedActions(MultiAction):
         self._shown: dict = {source: [] for source in self._per_step(parent.observation_spec).values()}
         self._reward: torch.Tensor | None = None
         td = tensordict.copy()
+        undrawn = nullcontext if self.frames or _watched(parent) else getattr(parent, "undrawn", nullcontext)
         for index in range(self.chunk_length):
             td.set(ACTION, chunk[..., index, :])
             td.set("_step", active)
             self._active = active
             if index == self.chunk_length - 1:
                 return td  # the environment around this transform executes the last action
-            td = parent.step(td)
+            with undrawn():
+                td = parent.step(td)
             self._record(td["next"])
             done = td["next", "done"].reshape(active.shape)
             td = parent.step_mdp(td)
@@ -110,6 +124,8 @@ class ChunkedActions(MultiAction):
         # Nothing is left to execute: the env copies its output from the entries that it finds here.
         td.set("_step", active)
         td.set("reward", self._reward)
+        if undrawn is not nullcontext:
+            td["observation"] = td["observation"].clone(False).update(parent.draw())
         self._write(td)
         return td
 

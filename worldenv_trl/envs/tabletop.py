@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -185,6 +186,7 @@ class TabletopEnv(TabletopStarts, EnvBase):
         self._context, self._steps = np.full((n, 1), UNKNOWN_CONTEXT, np.int64), np.zeros((n, 1), np.int64)
         self._success, self._terminated, self._truncated = (np.zeros((n, 1), bool) for _ in range(3))
         self._reward = np.zeros((n, 1), np.float32)
+        self._drawing, self._moved = True, np.zeros(n, bool)  # what is not drawn yet has moved
         self._task, self._limit = np.zeros((n, 1), np.int64), np.zeros((n, 1), np.int64)
         words = [""] * n
         for block in self._blocks:
@@ -217,6 +219,24 @@ class TabletopEnv(TabletopStarts, EnvBase):
     def scenes(self) -> list[tuple[SceneBatch, np.ndarray]]:
         """The simulation of each task and the rows of the env it runs: privileged state, for experts and checks."""
         return [(block.scene, block.rows) for block in self._blocks]
+
+    @contextmanager
+    def undrawn(self) -> Iterator[None]:
+        """Steps inside draw nothing and show the images from before: for who does not look at them. The next step or
+        :meth:`draw` outside draws every row that has moved since."""
+        self._drawing = False
+        try:
+            yield
+        finally:
+            self._drawing = True
+
+    def draw(self) -> TensorDict:
+        """The images of all rows as they are now, by the name of their entry below ``"observation"``."""
+        self._check_open()
+        if self._pool is not None and self._moved.any():
+            self._start_drawing(np.zeros(self.num_envs, bool))()
+        images = {image_entry(name): torch.from_numpy(image.copy()) for name, image in self._images.items()}
+        return TensorDict(images, batch_size=self.batch_size, device=self.device)
 
     def progress(self) -> dict[str, np.ndarray]:
         """``task_id``, ``context_id`` and ``num_steps`` of every row as they are now, int64 [n, 1] each (copies)."""
@@ -301,21 +321,35 @@ class TabletopEnv(TabletopStarts, EnvBase):
 
     def _read(self, active: np.ndarray) -> None:
         """Brings what ``active`` rows show up to date."""
-        parts = [(block, local) for block in self._blocks if len(local := np.flatnonzero(active[block.rows]))]
-        if not parts:
-            return
-        finish = None
-        if self._pool is not None:
-            poses = [block.scene.poses(local) for block, local in parts]
-            drawings = [block.scene.drawing for block, _ in parts if block.scene.drawing is not None]
-            finish = self._pool.start(drawings, poses)
+        finish = self._start_drawing(active) if self._drawing and self._pool is not None else None
+        if finish is None:
+            self._moved |= active
+        parts = self._parts(active)
         try:
-            self._read_state(parts)  # while the images are drawn
+            if parts:
+                self._read_state(parts)  # while the images are drawn
         finally:
-            drawn = [] if finish is None else finish()
-        for (block, local), images in zip(parts, drawn, strict=finish is not None):
-            for buffer, image in zip(self._images.values(), images.values(), strict=True):
-                buffer[block.rows[local]] = image
+            if finish is not None:
+                finish()
+
+    def _parts(self, rows: np.ndarray) -> list[tuple[Block, np.ndarray]]:
+        """Which of each block's own rows are among ``rows`` bool [n], where there are any."""
+        return [(block, local) for block in self._blocks if len(local := np.flatnonzero(rows[block.rows]))]
+
+    def _start_drawing(self, active: np.ndarray) -> Callable[[], None]:
+        """Begins to draw ``active`` rows and those that moved undrawn; what it returns waits and keeps the images."""
+        parts = self._parts(active | self._moved)
+        poses = [block.scene.poses(local) for block, local in parts]
+        drawings = [block.scene.drawing for block, _ in parts if block.scene.drawing is not None]
+        finish = self._pool.start(drawings, poses) if self._pool is not None and parts else list
+
+        def keep() -> None:
+            for (block, local), images in zip(parts, finish(), strict=True):
+                for buffer, image in zip(self._images.values(), images.values(), strict=True):
+                    buffer[block.rows[local]] = image
+            self._moved[:] = False
+
+        return keep
 
     def _read_state(self, parts: list[tuple[Block, np.ndarray]]) -> None:
         scenes = [block.scene for block, _ in parts]
