@@ -70,6 +70,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     for name, value, known in (
         ("post_train.env", config.post_train.env, ("imagined", "tabletop")),
         ("post_train.contexts", config.post_train.contexts, ("uniform", "mixed")),
+        ("post_train.baseline", config.post_train.baseline, ("group", "learned")),
         ("post_train.ratio_level", config.post_train.ratio_level, ("step", "chunk", "token")),
         ("parallel", config.parallel, MODES),
         ("demonstrate.actions", config.demonstrate.actions, ACTIONS),
@@ -156,6 +157,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         ("reflector.imagined_share", config.reflector.imagined_share),
         ("reflector.holdout", config.reflector.holdout),
         ("post_train.branch_share", config.post_train.branch_share),
+        ("post_train.baseline_lambda", config.post_train.baseline_lambda),
         ("post_train.averaging", config.post_train.averaging),
         ("post_train.source_share", config.post_train.source_share),
     ):
@@ -171,6 +173,13 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         raise ValueError(
             "post_train.iterations must be at least 3 with post_train.branch_share: the first and the last begin at "
             f"initial states, got {config.post_train.iterations}"
+        )
+    if not 0 <= config.post_train.momentum < 1:
+        raise ValueError(f"post_train.momentum must be at least 0 and below 1, got {config.post_train.momentum}")
+    if min(config.post_train.lora_lr, config.post_train.head_lr) < 0 or not config.post_train.head_lr:
+        raise ValueError(
+            "post_train.head_lr must be positive and post_train.lora_lr at least 0, got "
+            f"{config.post_train.head_lr} and {config.post_train.lora_lr}"
         )
     if not 0 < config.post_train.false_alarm_rate < 1:
         raise ValueError(

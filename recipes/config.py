@@ -155,8 +155,16 @@ class PostTrain:
     physics."""
     branch_until: int = 40
     """The last step at which they begin."""
+    baseline: str = "group"
+    """What a return is held against: ``group``, the other returns of its group (World-Env Eq. 4), the same for all
+    decisions of a rollout; or ``learned``, at each decision the return that is to be expected there, learned from the
+    waves so far."""
+    baseline_lambda: float = 0.7
+    """Of the learned one: 1 credits a decision with all that comes after it, 0 with what changes until the next."""
     epochs: int = 4
     minibatch_size: int = 256
+    momentum: float = 0.9
+    """Adam's first decay: with .95 and two updates a wave, an update goes where the last ten waves point."""
     clip_epsilon: float = 0.1
     ratio_level: str = "step"
     """``step`` (World-Env Eq. 5), ``chunk``: one ratio for all steps of a chunk, or ``token``: one for each token of a
@@ -164,6 +172,7 @@ class PostTrain:
     lora_rank: int = 16
     """Of the adapters; at 0 the whole policy is updated instead, but for frozen encoders."""
     lora_lr: float = 2e-4
+    """Of the adapters, or of the rest of the policy at rank 0; at 0 the heads alone are updated."""
     head_lr: float = 2e-4
     averaging: float = 0.8
     """Decay per iteration of the running mean of the weights that is saved."""

@@ -16,6 +16,7 @@ from tensordict import TensorDictBase
 
 import processes
 from averaging import RunningMean
+from baseline import LearnedBaseline
 from data_parallel import DataParallel, WholeOptimizer
 from physics import exploring_actor, recording
 from probes import probe, probed_iterations, warning
@@ -57,6 +58,10 @@ def post_train(
     run.seed_everything(target)
     policy = run.policy(source)
     groups = policy.post_training_parameters(settings.lora_rank)
+    rates = {name: settings.head_lr if name == "heads" else settings.lora_lr for name in groups}
+    for name in [name for name, rate in rates.items() if not rate]:
+        for parameter in groups.pop(name):
+            parameter.requires_grad_(False)
     actor = exploring_actor(config, policy, settings.scale_factor)
 
     sampler = ContextSampler() if settings.contexts == "mixed" else None
@@ -75,10 +80,8 @@ def post_train(
     learner = DataParallel(policy, make_loss, config.parallel)
     groups = {name: learner.trained(parameters) for name, parameters in groups.items()}
     optimizer = torch.optim.AdamW(
-        [
-            {"params": parameters, "lr": settings.head_lr if name == "heads" else settings.lora_lr}
-            for name, parameters in groups.items()
-        ],
+        [{"params": parameters, "lr": rates[name]} for name, parameters in groups.items()],
+        betas=(settings.momentum, 0.999),
         weight_decay=0.0,
     )
     full_rates = [group["lr"] for group in optimizer.param_groups]
@@ -91,8 +94,9 @@ def post_train(
     probed, recorded = probed_iterations(settings), {0, settings.iterations - 1}
     alarm = HonestyAlarm(len(probed), false_alarm_rate=settings.false_alarm_rate) if probed and imagination else None
     counts = {"stuck": 0}
+    baseline = LearnedBaseline(policy, config) if settings.baseline == "learned" else None
     learning: dict[str, Any] = {"collector": waves.collector, "optimizer": WholeOptimizer(optimizer)}
-    learning |= {"mean": mean, "alarm": alarm, "counts": counts}
+    learning |= {"mean": mean, "alarm": alarm, "counts": counts, "baseline": baseline}
     left = Resumable(run, "iterations", settings.iterations, **learning)
     learner.scatter()
     waves.record_next(left.step in recorded)
@@ -107,10 +111,14 @@ def post_train(
         returns = processes.gathered(returns_of(mine))  # [G, N], of all processes
         if sampler is not None:
             sampler.update(processes.gathered(mine[keys.CONTEXT_ID][:, 0, 0, 0]), returns)
-        advantage = rloo_advantage(returns)
-        if settings.standardize:
-            advantage = advantage / advantage.std().clamp_min(1e-6)
-        mine[keys.ADVANTAGE] = _expanded(processes.own_rows_of(advantage), mine)
+        if baseline is None:
+            advantage = rloo_advantage(returns)
+            if settings.standardize:
+                advantage = advantage / advantage.std().clamp_min(1e-6)
+            advantage = advantage.unsqueeze(-1)  # the same at every decision
+        else:
+            advantage = baseline.advantage(mine, returns)
+        mine[keys.ADVANTAGE] = _at_decisions(processes.own_rows_of(advantage), mine)
         about = {}
         if iteration in recorded and processes.is_main():  # of the weights that collected it
             about = recording(config, waves.env, target, {"policy": policy} | waves.judges, iteration=iteration)
@@ -121,13 +129,15 @@ def post_train(
             progress.write(STUCK.format(target, iteration, PATIENCE, settings.max_kl))
         if about:
             if wave is not mine:
-                wave[keys.ADVANTAGE] = _expanded(advantage, wave)
+                wave[keys.ADVANTAGE] = _at_decisions(advantage, wave)
             wave.update(ratios(wave, read, make_loss(policy)))
             _write(run, f"{target}_{iteration:03d}", about, wave, waves.aside)
         mean.update()
         waves.update_policy_weights_()
 
         metrics |= _wave_metrics(mine, returns, config.tasks)
+        if baseline is not None:
+            metrics["explained"] = baseline.explained
         if sampler is not None:
             metrics["contexts_seen"] = len(sampler)
         if imagination is not None and imagination.branch_points is not None:
@@ -151,9 +161,9 @@ def post_train(
         averaged.save_pretrained(run.folder.checkpoint(target))
 
 
-def _expanded(advantage: torch.Tensor, wave: TensorDictBase) -> torch.Tensor:
-    """Of rollouts [G, N], at each decision of theirs."""
-    return advantage[..., None, None].expand(*wave.shape, 1)
+def _at_decisions(advantage: torch.Tensor, wave: TensorDictBase) -> torch.Tensor:
+    """[G, N, T, 1] of advantages [G, N, 1], or of as many decisions as a rollout can have."""
+    return advantage[..., : wave.shape[-1], None].expand(*wave.shape, 1)
 
 
 def _write(run: Run, name: str, about: dict, wave: TensorDictBase, aside: FramesAside | None) -> None:

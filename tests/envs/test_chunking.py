@@ -1,6 +1,7 @@
 """Chunked actions: one decision is exactly its steps, and a stop inside a chunk stops there."""
 
 import dataclasses
+import itertools
 
 import pytest
 import torch
@@ -249,7 +250,7 @@ def test_images_inside_a_chunk_are_drawn_for_who_looks_at_them():
     env = chunked(TransformedEnv(make(2), watching), C)
     env.step(env.reset().set(CHUNK, plan(C, 2).transpose(0, 1)))
     assert len(watching.seen) == C
-    assert all(not torch.equal(before, after) for before, after in zip(watching.seen, watching.seen[1:], strict=False))
+    assert all(not torch.equal(before, after) for before, after in itertools.pairwise(watching.seen))
     env.close()
 
 

@@ -62,7 +62,7 @@ def _watched(env: EnvBase) -> bool:
     """Whether a transform of the env looks at its images step by step."""
     while isinstance(env, TransformedEnv):
         keys = {key for part in _parts(env.transform) for key in part.in_keys}
-        if any(key == "observation" or key[0] == "observation" and key != STATE for key in keys):
+        if any(key == "observation" or (key[0] == "observation" and key != STATE) for key in keys):
             return True
         env = env.base_env
     return False
