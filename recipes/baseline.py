@@ -12,6 +12,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 import processes
 from config import WorldEnvConfig
 from worldenv_trl import keys
+from worldenv_trl.data.store import without_notices
 from worldenv_trl.devices import device_of, to_device
 from worldenv_trl.objectives import ValueBaseline, baseline_advantage
 from worldenv_trl.policies import Hidden, Policy
@@ -66,7 +67,9 @@ class LearnedBaseline:
             values = _judged(self._value, features)
         reached = returns.unsqueeze(-1).expand_as(mask)[mask]
         self.explained = 1 - ((reached - values[mask]).square().mean() / reached.var().clamp_min(1e-6)).item()
-        self._seen.extend(self._decisions_of(features, mask, returns, torch.ones(len(mask), dtype=torch.bool)))
+        everyone = torch.ones(len(mask), dtype=torch.bool)
+        with without_notices():
+            self._seen.extend(self._decisions_of(features, mask, returns, everyone))
         self._learn(self._value, self._seen)
         advantage = baseline_advantage(returns, values, mask, self._lmbda)
         return advantage / advantage[mask].std().clamp_min(1e-6) if self._standardize else advantage

@@ -65,7 +65,7 @@ class FrameSink:
             raise ValueError(
                 f"there is room for {self._capacity} frames, {self._count} are there: {len(frames)} do not fit"
             )
-        with _without_notices():
+        with without_notices():
             self.buffer.extend(frames)
         self._count += len(frames)
         if self._folder is not None:
@@ -240,7 +240,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 @contextmanager
-def _without_notices() -> Iterator[None]:
+def without_notices() -> Iterator[None]:
     """TorchRL tells of every storage that it begins."""
     before = torchrl_logger.level
     torchrl_logger.setLevel(logging.WARNING)
