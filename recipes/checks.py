@@ -69,7 +69,6 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         raise ValueError(f"tasks names a task twice: {', '.join(config.tasks)}")
     for name, value, known in (
         ("post_train.env", config.post_train.env, ("imagined", "tabletop")),
-        ("post_train.contexts", config.post_train.contexts, ("uniform", "mixed")),
         ("post_train.baseline", config.post_train.baseline, ("group", "learned")),
         ("post_train.ratio_level", config.post_train.ratio_level, ("step", "chunk", "token")),
         ("parallel", config.parallel, MODES),

@@ -146,9 +146,6 @@ class PostTrain:
     iterations: int = 24
     groups: int = 24
     group_size: int = 8
-    contexts: str = "uniform"
-    """``uniform`` (each context as often as any other of its task) or ``mixed`` (more often where the returns of a
-    group are expected to differ: groups that all succeed or all fail teach nothing)."""
     branch_share: float = 0.0
     """Share of the groups that begin in imagination in the middle of an explored episode, on its real frames, instead
     of at an initial state. Waves that are recorded, the first and the last, have none: they are relived in the

@@ -18,7 +18,7 @@ from run import Run
 from worldenv_trl import keys
 from worldenv_trl.data import Episodes
 from worldenv_trl.devices import to_device
-from worldenv_trl.envs import BranchPoints, ContextSampler, FramesAside, ImaginedEnv, Reflect
+from worldenv_trl.envs import BranchPoints, FramesAside, ImaginedEnv, Reflect
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.row_texts import row_texts
@@ -60,13 +60,12 @@ class Imagination:
         contexts: TensorDict | None = None,
         *,
         seed: int,
-        sampler: ContextSampler | None = None,
         branches: bool = False,
     ) -> TransformedEnv:
         """FK, action map, world model; the reflector gives the reward and stops; frames are not carried along."""
         groups, group_size = batch_size
         make = self.makes(run, group_size, contexts, seed=seed, branches=branches)
-        return make(groups, sampler=sampler, transforms=[FramesAside(run.folder.scratch)])
+        return make(groups, transforms=[FramesAside(run.folder.scratch)])
 
     def makes(
         self, run: Run, group_size: int, contexts: TensorDict | None = None, *, seed: int, branches: bool = False
@@ -90,7 +89,6 @@ def _imagined(
     group_size: int,
     groups: int,
     *,
-    sampler: ContextSampler | None = None,
     transforms: Sequence[Transform] = (),
     **options: Any,
 ) -> TransformedEnv:
@@ -99,7 +97,6 @@ def _imagined(
         kinematics,
         imagination.contexts,
         batch_size=[groups, group_size],
-        context_sampler=sampler,
         **options,
     )
     return TransformedEnv(env, Compose(Reflect(imagination.reflector, imagination.rule), *transforms))

@@ -12,7 +12,7 @@ from torchrl.modules import MultiStepActorWrapper
 from config import WorldEnvConfig
 from parts import PROPRIO
 from seeds import stage_seed
-from worldenv_trl.envs import ContextSampler, TabletopEnv, chunked
+from worldenv_trl.envs import TabletopEnv, chunked
 from worldenv_trl.policies import AutoregressiveActor, DeviceBridge, LaplaceActor, Policy, policy_actor, scale_bounds
 from worldenv_trl.record import provenance
 
@@ -51,11 +51,9 @@ def step_env(
     return TransformedEnv(tabletop(config, split, num_envs, tasks, **options), InitTracker())
 
 
-def physics_waves_env(
-    config: WorldEnvConfig, groups: int, group_size: int, *, sampler: ContextSampler | None = None, **more: Any
-) -> EnvBase:
+def physics_waves_env(config: WorldEnvConfig, groups: int, group_size: int, **more: Any) -> EnvBase:
     """Physics, one chunk a step, rows in groups that share an initial state: LOOP's upper bound."""
-    options = {"group_repeats": group_size, "with_sim_state": True, "context_sampler": sampler} | more
+    options = {"group_repeats": group_size, "with_sim_state": True} | more
     return chunked(tabletop(config, "train", groups * group_size, None, **options), config.chunk_length)
 
 

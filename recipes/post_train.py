@@ -26,7 +26,7 @@ from stages import run_alone
 from updates import PATIENCE, STUCK, rate_factor, ratios, stuck, update
 from waves import Waves
 from worldenv_trl import keys
-from worldenv_trl.envs import ContextSampler, FramesAside
+from worldenv_trl.envs import FramesAside
 from worldenv_trl.metrics import HonestyAlarm
 from worldenv_trl.objectives import LOOPLoss, rloo_advantage
 from worldenv_trl.policies import Policy, TokenPolicy, policy_actor
@@ -64,8 +64,7 @@ def post_train(
             parameter.requires_grad_(False)
     actor = exploring_actor(config, policy, settings.scale_factor)
 
-    sampler = ContextSampler() if settings.contexts == "mixed" else None
-    waves = Waves(run, target, models, actor, sampler)
+    waves = Waves(run, target, models, actor)
     imagination = waves.imagination
     read = [*policy.in_keys, *([keys.TOKENS] if isinstance(policy, TokenPolicy) else [])]
     read += [key for key in (keys.TOKEN_IS_PAD,) if key in actor.out_keys]
@@ -109,8 +108,6 @@ def post_train(
         for group, rate in zip(optimizer.param_groups, full_rates, strict=True):
             group["lr"] = factor * rate
         returns = processes.gathered(returns_of(mine))  # [G, N], of all processes
-        if sampler is not None:
-            sampler.update(processes.gathered(mine[keys.CONTEXT_ID][:, 0, 0, 0]), returns)
         if baseline is None:
             advantage = rloo_advantage(returns)
             if settings.standardize:
@@ -138,8 +135,6 @@ def post_train(
         metrics |= _wave_metrics(mine, returns, config.tasks)
         if baseline is not None:
             metrics["explained"] = baseline.explained
-        if sampler is not None:
-            metrics["contexts_seen"] = len(sampler)
         if imagination is not None and imagination.branch_points is not None:
             metrics["branched"] = processes.gathered(mine[keys.NUM_STEPS][:, 0, 0, 0] > 0).float().mean().item()
         metrics["iteration_seconds"], started = time.monotonic() - started, time.monotonic()

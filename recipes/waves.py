@@ -19,7 +19,7 @@ from physics import physics_waves_env
 from run import Run
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
-from worldenv_trl.envs import ContextSampler, FramesAside
+from worldenv_trl.envs import FramesAside
 from worldenv_trl.policies import AutoregressiveActor, DeviceBridge, LaplaceActor
 
 _LEARNED_FROM = (
@@ -51,14 +51,7 @@ class Waves:
     collector: GroupCollector | None = None
     imagination: Imagination | None = None
 
-    def __init__(
-        self,
-        run: Run,
-        target: str,
-        models: str,
-        actor: LaplaceActor | AutoregressiveActor,
-        sampler: ContextSampler | None,
-    ) -> None:
+    def __init__(self, run: Run, target: str, models: str, actor: LaplaceActor | AutoregressiveActor) -> None:
         settings, size = run.config.post_train, run.config.post_train.group_size
         self._groups, self._read = settings.groups // processes.size(), [*actor.policy.in_keys, *_LEARNED_FROM]
         self._branch_share = settings.branch_share
@@ -67,12 +60,12 @@ class Waves:
         make: Callable[..., EnvBase]
         if settings.env == "imagined":
             self.imagination = Imagination.load(run, models)
-            self.env = self.imagination.env(run, [self._groups, size], seed=seed, sampler=sampler, branches=True)
+            self.env = self.imagination.env(run, [self._groups, size], seed=seed, branches=True)
             make = self.imagination.makes(run, size, seed=seed, branches=True)
             self.judges = {"world_model": self.imagination.world_model, "reflector": self.imagination.reflector}
             mine = self._groups
         elif processes.is_main():
-            self.env = physics_waves_env(run.config, settings.groups, size, seed=seed, sampler=sampler)
+            self.env = physics_waves_env(run.config, settings.groups, size, seed=seed)
             make = partial(physics_waves_env, of_worker(run.config), group_size=size, seed=seed)
             mine = settings.groups
         if self.env is not None:

@@ -21,7 +21,6 @@ from torchrl.envs.utils import ExplorationType
 
 from worldenv_trl.collectors import SpreadCollector, check_shares
 from worldenv_trl.collectors.shares import shares_of
-from worldenv_trl.envs import ContextSampler
 from worldenv_trl.keys import CHUNK, CONTEXT_ID
 
 
@@ -145,22 +144,6 @@ def test_one_process_continues_from_the_starts_of_waves_that_were_ready():
     alone = spread(None, waves=4)
     alone.load_state_dict(state)
     assert contexts(waves_of(alone)) == contexts(rest) and len(rest) == 3
-
-
-def test_a_context_sampler_draws_here_and_learns_from_what_comes_back():
-    drawn = []
-    for workers in (None, Here()):
-        sampler = ContextSampler(seed=1)
-        collector = spread(workers, waves=3)
-        collector.env.close()
-        collector.env = make_env(GROUPS, context_sampler=sampler)
-        drawn.append([])
-        for wave in collector:
-            numbers = wave[CONTEXT_ID][:, 0, 0, 0]
-            drawn[-1].append(numbers.tolist())
-            sampler.update(numbers, torch.stack([numbers % 2, torch.ones_like(numbers)], -1).float())
-        collector.shutdown()
-    assert drawn[0] == drawn[1]
 
 
 def test_excluded_entries_stay_where_they_are_made():

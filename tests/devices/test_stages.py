@@ -30,8 +30,7 @@ def on_gpu(gpu, monkeypatch):
 
 def test_the_whole_loop_and_a_replay_of_it(tiny, on_gpu, monkeypatch):
     sampled = dataclasses.replace(tiny.world_model, deterministic=False, denoise_steps=2)
-    mixed = dataclasses.replace(tiny.post_train, contexts="mixed")
-    config = dataclasses.replace(tiny, device="cuda", world_model=sampled, post_train=mixed)
+    config = dataclasses.replace(tiny, device="cuda", world_model=sampled)
     run_all(config)
     stages = {json.loads(line)["stage"] for line in (tiny.run_dir / "metrics.jsonl").read_text().splitlines()}
     assert {"sft", "explore", "world_model", "reflector", "post_train", "evaluate"} <= stages

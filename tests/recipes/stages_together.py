@@ -38,7 +38,6 @@ SETTINGS = dataclasses.replace(
     reflector=config.Reflector(encoder_steps=20, steps=20, batch_size=4),
     post_train=config.PostTrain(
         iterations=5, groups=4, group_size=9, epochs=2, minibatch_size=36, probe_every=4, probe_contexts=2,
-        contexts="mixed",
     ),
 )  # fmt: skip
 

@@ -22,7 +22,6 @@ from run_folder import RunFolder
 from stages import open_run
 from updates import STUCK, stuck, update
 from worldenv_trl import keys
-from worldenv_trl.envs import ContextSampler
 from worldenv_trl.metrics import HonestyAlarm
 from worldenv_trl.objectives import LOOPLoss
 from worldenv_trl.policies import OFTConfig, OFTPolicy, laplace_actor
@@ -62,35 +61,15 @@ def physics(tiny):
     return run
 
 
-def contexts_drawn(run, contexts):
-    """Contexts [iterations, G] of a run whose groups are mixed where they start from the first two states."""
+def test_contexts_come_in_shuffled_passes(physics):
     drawn = []
 
     def returns_of(wave):
         drawn.append(wave[keys.CONTEXT_ID][:, 0, 0, 0].tolist())
         return torch.tensor([[1.0, float(number > 1)] for number in drawn[-1]])
 
-    settings = dataclasses.replace(run.config.post_train, contexts=contexts)
-    run = dataclasses.replace(run, config=dataclasses.replace(run.config, post_train=settings))
-    post_train(run, "sft", "post_train", "", returns_of=returns_of)
-    return drawn
-
-
-def test_mixed_contexts_are_drawn_by_the_returns_that_are_learned_from(physics):
-    sampler, expected = ContextSampler(seed=physics.seed("post_train", "env")), []
-    for _ in range(4):
-        expected.append(sampler.draw(range(4), 2))  # of one task, ids are places
-        returns = torch.tensor([[1.0, float(number > 1)] for number in expected[-1]])
-        sampler.update(torch.tensor(expected[-1]), returns)
-    assert contexts_drawn(physics, "mixed") == expected
-    seen = [line["contexts_seen"] for line in physics.folder.read_metrics("post_train")]
-    assert seen == [len({number for wave in expected[: i + 1] for number in wave}) for i in range(4)]
-
-
-def test_uniform_contexts_come_in_shuffled_passes(physics):
-    drawn = contexts_drawn(physics, "uniform")
+    post_train(physics, "sft", "post_train", "", returns_of=returns_of)
     assert sorted(drawn[0] + drawn[1]) == sorted(drawn[2] + drawn[3]) == [0, 1, 2, 3]
-    assert all("contexts_seen" not in line for line in physics.folder.read_metrics("post_train"))
 
 
 def saved(run, share, returns_of):

@@ -64,7 +64,6 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
             "ratio_level must be step or chunk for OFTPolicy, which does not",
         ),
         ({"post_train": PostTrain(ratio_level="foo")}, "ratio_level must be one of step, chunk, token, got 'foo'"),
-        ({"post_train": PostTrain(contexts="hard")}, "contexts must be one of uniform, mixed, got 'hard'"),
         ({"post_train": PostTrain(group_size=1)}, "group_size must be at least 2"),
         ({"post_train": PostTrain(source_share=1.5)}, "post_train.source_share must lie between 0 and 1, got 1.5"),
         ({"post_train": PostTrain(averaging=-0.1)}, "post_train.averaging must lie between 0 and 1, got -0.1"),

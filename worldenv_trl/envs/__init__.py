@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from worldenv_trl.context_ids import context_id
     from worldenv_trl.envs.branch_points import BranchPoints
     from worldenv_trl.envs.chunking import ChunkedActions, chunked
-    from worldenv_trl.envs.context_sampler import ContextSampler
     from worldenv_trl.envs.expert import ExpertPolicy
     from worldenv_trl.envs.frames_aside import FramesAside
     from worldenv_trl.envs.imagined import ImaginedEnv
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
 __all__ = [
     "BranchPoints",
     "ChunkedActions",
-    "ContextSampler",
     "ExpertPolicy",
     "FramesAside",
     "ImaginedEnv",
@@ -37,7 +35,6 @@ __all__ = [
 _HOMES = {
     "BranchPoints": "worldenv_trl.envs.branch_points",
     "ChunkedActions": "worldenv_trl.envs.chunking",
-    "ContextSampler": "worldenv_trl.envs.context_sampler",
     "ExpertPolicy": "worldenv_trl.envs.expert",
     "FramesAside": "worldenv_trl.envs.frames_aside",
     "ImaginedEnv": "worldenv_trl.envs.imagined",

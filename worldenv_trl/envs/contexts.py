@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from worldenv_trl.envs.context_sampler import ContextSampler, check_numbered
 from worldenv_trl.keys import (
     CONTEXT_ID,
     INSTRUCTION,
@@ -58,63 +57,31 @@ def check_contexts(
 
 
 class ContextOrder:
-    """Which context each group starts from, the tasks in turn.
+    """Which context each group starts from: shuffled pass after shuffled pass, the tasks in turn.
 
     Args:
-        contexts: TensorDict [K] with their task ids and context ids.
-        sampler: draws the contexts of each task; without one they come in shuffled passes.
-
-    Raises:
-        ValueError: if a sampler is to draw contexts without numbers.
+        contexts: TensorDict [K] with their task ids.
     """
 
-    def __init__(self, contexts: TensorDictBase, sampler: ContextSampler | None) -> None:
-        self.sampler = sampler
-        self._tasks, self._ids = contexts[TASK_ID].flatten().tolist(), contexts[CONTEXT_ID].flatten().tolist()
-        if sampler is not None:
-            check_numbered(self._ids)
+    def __init__(self, contexts: TensorDictBase) -> None:
+        self._tasks = contexts[TASK_ID].flatten().tolist()
         self.seed(0)
 
     def seed(self, seed: int) -> None:
         self._generator = torch.Generator().manual_seed(seed)
         self._queue: list[int] = []
-        self._turn = 0  # of the tasks, for a sampler
-        if self.sampler is not None:
-            self.sampler.seed(seed)
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the draws are, the sampler's included."""
-        sampler = None if self.sampler is None else self.sampler.state_dict()
-        return {
-            "generator": self._generator.get_state(),
-            "queue": list(self._queue),
-            "turn": self._turn,
-            "sampler": sampler,
-        }
+        """Where the draws are."""
+        return {"generator": self._generator.get_state(), "queue": list(self._queue)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Draws on from there, of the same contexts."""
         self._generator.set_state(state_dict["generator"])
-        self._queue, self._turn = list(state_dict["queue"]), state_dict["turn"]
-        if self.sampler is not None:
-            self.sampler.load_state_dict(state_dict["sampler"])
+        self._queue = list(state_dict["queue"])
 
     def draw(self, count: int) -> list[int]:
         """Places in the contexts [K] of the next ``count`` groups: no context twice in a draw if it can be."""
-        return self._shuffled(count) if self.sampler is None else self._sampled(count, self.sampler)
-
-    def _sampled(self, count: int, sampler: ContextSampler) -> list[int]:
-        tasks = sorted(set(self._tasks))
-        turns = [tasks[(self._turn + group) % len(tasks)] for group in range(count)]
-        self._turn = (self._turn + count) % len(tasks)
-        drawn = {}
-        for task in sorted(set(turns)):
-            places = [place for place, other in enumerate(self._tasks) if other == task]
-            chosen = sampler.draw([self._ids[place] for place in places], turns.count(task))
-            drawn[task] = iter([places[index] for index in chosen])
-        return [next(drawn[task]) for task in turns]
-
-    def _shuffled(self, count: int) -> list[int]:
         drawn: list[int] = []
         while len(drawn) < count:
             if not self._queue:

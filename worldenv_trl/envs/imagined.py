@@ -11,7 +11,6 @@ from torchrl.envs import EnvBase
 
 from worldenv_trl.devices import to_device
 from worldenv_trl.envs.branch_points import BranchPoints
-from worldenv_trl.envs.context_sampler import ContextSampler
 from worldenv_trl.envs.contexts import ContextOrder, check_contexts, context_keys
 from worldenv_trl.envs.imagined_specs import imagined_specs
 from worldenv_trl.envs.imagined_starts import ImaginedStarts
@@ -71,7 +70,6 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
             ``"measured"`` the pose of the predicted joints.
         seed: of the contexts' order and of the noise; drawn from torch's generator when None.
         device: of the specs and buffers; the contexts' when None. World model and kinematics must be there, too.
-        context_sampler: draws the contexts of each task by how mixed their groups were, instead of in shuffled passes.
         branch_points: where some of the groups begin instead of at a context of their task: in the middle of an
             episode, whose real frames are then what the world model remembers. Such a rollout cannot be replayed from
             its recording alone, nor relived from its ``context_id``: set their ``share`` to 0 for waves that are kept.
@@ -107,7 +105,6 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
         proprio: str = "commanded",
         seed: int | None = None,
         device: torch.device | str | None = None,
-        context_sampler: ContextSampler | None = None,
         branch_points: BranchPoints | None = None,
     ) -> None:
         batch = torch.Size(batch_size)
@@ -127,8 +124,7 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
         self.max_steps, self.chunk_length, self.proprio = int(max_steps), world_model.chunk_length, proprio
         self._contexts = contexts.select(*context_keys(self.cameras)).to(device).contiguous()
         self._instructions = instructions_of(contexts)
-        self.context_sampler, self._order = context_sampler, ContextOrder(contexts, context_sampler)
-        self.branch_points = branch_points
+        self._order, self.branch_points = ContextOrder(contexts), branch_points
         if branch_points is not None:
             branch_points.episodes.require("the world model", world_model.cameras, world_model.image_size)
             if branch_points.chunk_length != self.chunk_length or branch_points.latest >= self.max_steps:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
 from torch import Tensor
 
 from worldenv_trl.context_ids import UNKNOWN_CONTEXT, context_id, parts_of
-from worldenv_trl.envs.context_sampler import ContextSampler, check_numbered
 from worldenv_trl.scenes import Task
 
 __all__ = ["MODES", "InitStates"]
@@ -34,12 +32,11 @@ class InitStates:
         init_state_id: see ``mode``.
         states: ``[K, S]`` states to use instead of the split's.
         context_ids: ``[K]`` their numbers; unknown ones are -1.
-        sampler: draws the states instead, by how mixed the groups were that started from them; ``random`` only.
 
     Raises:
         TypeError: for states or numbers that are none.
         ValueError: for an unknown mode, an index out of range, states of another task's length or that hold NaN or
-            infinity, and numbers that do not match the states or name two of them, or that a sampler cannot do without.
+            infinity, and numbers that do not match the states or name two of them.
     """
 
     def __init__(
@@ -53,7 +50,6 @@ class InitStates:
         init_state_id: int = 0,
         states: np.ndarray | Tensor | None = None,
         context_ids: Sequence[int] | None = None,
-        sampler: ContextSampler | None = None,
     ) -> None:
         if mode not in MODES:
             raise ValueError(f"init_state_mode must be 'random', 'cycle' or 'fixed', got {mode!r}")
@@ -68,11 +64,7 @@ class InitStates:
             self.context_ids = unknown if context_ids is None else _numbers(context_ids, self.states)
         if not 0 <= init_state_id < len(self.states):
             raise ValueError(f"init_state_id must be in [0, {len(self.states)}), got {init_state_id}")
-        if sampler is not None:
-            if mode != "random":
-                raise ValueError(f"a context sampler draws at random: init_state_mode must be 'random', got {mode!r}")
-            check_numbered(self.context_ids)
-        self.task, self.mode, self.sampler = task, mode, sampler
+        self.task, self.mode = task, mode
         self.task_id, self.init_state_id = task_id, init_state_id
         # Of the order alone: a function of the task's name, not of its number in the run at hand.
         self._identity = int.from_bytes(hashlib.sha256(task.name.encode()).digest()[:8], "big")
@@ -81,48 +73,18 @@ class InitStates:
     def seed(self, seed: int) -> None:
         self._seed = seed
         self._orders: dict[int, np.ndarray] = {}  # of each pass over the states
-        self._sampled: dict[int, int] = {}  # the state of each episode that a sampler drew
-        if self.sampler is not None:
-            self.sampler.seed(seed)
-
-    def state_dict(self) -> dict[str, Any]:
-        """The seed and, of a sampler, what it has drawn and where it is."""
-        sampler = None if self.sampler is None else self.sampler.state_dict()
-        return {"seed": self._seed, "sampled": dict(self._sampled), "sampler": sampler}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Draws on from there, of the same states."""
-        self.seed(state_dict["seed"])
-        self._sampled = dict(state_dict["sampled"])
-        if self.sampler is not None:
-            self.sampler.load_state_dict(state_dict["sampler"])
 
     def draw(self, number: int) -> tuple[int, np.ndarray]:
-        """Context id and state ``[S]`` of the task's ``number``-th episode: a function of seed and number only, but for
-        a sampler, which draws an episode's state once, when it is first asked for."""
-        numbers, states = self.draw_together([number])
-        return numbers[0], states[0]
-
-    def draw_together(self, numbers: Sequence[int]) -> tuple[list[int], np.ndarray]:
-        """Context ids and states ``[n, S]`` of episodes that begin together; see :meth:`places`."""
-        return self.at(self.places(numbers))
-
-    def places(self, numbers: Sequence[int]) -> list[int]:
-        """Which of the states episodes that begin together start from: a sampler draws none twice for them if it can
-        be. Equal numbers are one episode's."""
-        if self.sampler is not None:
-            new = sorted(set(numbers) - self._sampled.keys())
-            self._sampled.update(zip(new, self.sampler.draw(self.context_ids, len(new)), strict=True))
-        return [self._place(number) for number in numbers]
+        """Context id and state ``[S]`` of the task's ``number``-th episode; see :meth:`place`."""
+        place = self.place(number)
+        return self.context_ids[place], self.states[place]
 
     def at(self, places: Sequence[int]) -> tuple[list[int], np.ndarray]:
         """Context ids and states ``[n, S]`` at some places."""
         return [self.context_ids[place] for place in places], self.states[list(places)]
 
-    def _place(self, number: int) -> int:
-        """Of the ``number``-th episode's state."""
-        if self.sampler is not None:
-            return self._sampled[number]
+    def place(self, number: int) -> int:
+        """Which of the states the task's ``number``-th episode starts from: a function of seed and number only."""
         count = len(self.states)
         if self.mode == "fixed":
             return self.init_state_id

@@ -15,7 +15,6 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from worldenv_trl.context_ids import UNKNOWN_CONTEXT
-from worldenv_trl.envs.context_sampler import ContextSampler
 from worldenv_trl.envs.init_states import InitStates
 from worldenv_trl.envs.tabletop_arguments import (
     check_cameras,
@@ -52,10 +51,10 @@ __all__ = ["TabletopEnv"]
 class TabletopEnv(TabletopStarts, EnvBase):
     """``num_envs`` copies of one or several tasks, stepped and rendered together. Batch-locked; honours ``_step``.
 
-    A row's episode is a function of (seed, number of the episode, actions, what a ``context_sampler`` was told), bit
-    for bit, whatever the batch and the threads: a batch of 16 draws in one reset what one row draws in 16. A row whose
-    physics blows up is truncated, with a warning that says how to see it again; the others do not notice. A row that
-    has ended reports its end until it is reset, whether it is stepped or not.
+    A row's episode is a function of (seed, number of the episode, actions), bit for bit, whatever the batch and the
+    threads: a batch of 16 draws in one reset what one row draws in 16. A row whose physics blows up is truncated, with
+    a warning that says how to see it again; the others do not notice. A row that has ended reports its end until it is
+    reset, whether it is stepped or not.
 
     Args:
         task: a task, its name or file, or several: groups of rows are dealt to the tasks in turn (round robin).
@@ -72,7 +71,6 @@ class TabletopEnv(TabletopStarts, EnvBase):
         init_state_id: the fixed state, or where the cycle starts.
         init_state_count: how many states of the split take part, at most 50,000; 50 is the standard protocol.
         init_states: float64 [K, S] to use instead of the split's (one task only), with their ``context_ids`` [K].
-        context_sampler: draws a task's states by how mixed their groups were, instead of in shuffled passes.
         group_repeats: that many consecutive rows share one initial state (the rollouts of an RLOO group).
         terminate_on_success: end a row when its goal holds; reward is 1 on that step, else 0. When False, a row runs to
             ``max_steps`` and reward is the success of each step.
@@ -119,7 +117,6 @@ class TabletopEnv(TabletopStarts, EnvBase):
         init_state_count: int = 50,
         init_states: np.ndarray | torch.Tensor | None = None,
         context_ids: Sequence[int] | None = None,
-        context_sampler: ContextSampler | None = None,
         group_repeats: int = 1,
         terminate_on_success: bool = True,
         max_steps: int | None = None,
@@ -140,7 +137,7 @@ class TabletopEnv(TabletopStarts, EnvBase):
         check_cameras(cameras, tasks)
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_envs]))
         self.tasks, self.task_ids = tuple(tasks), numbers
-        self.cameras, self.image_size, self.context_sampler = tuple(cameras), image_size, context_sampler
+        self.cameras, self.image_size = tuple(cameras), image_size
         self.terminate_on_success, self.proprio, self.with_sim_state = terminate_on_success, proprio, with_sim_state
         starts = [
             InitStates(
@@ -152,7 +149,6 @@ class TabletopEnv(TabletopStarts, EnvBase):
                 init_state_id=init_state_id,
                 states=init_states,
                 context_ids=context_ids,
-                sampler=context_sampler,
             )
             for item, number in zip(tasks, numbers, strict=True)
         ]

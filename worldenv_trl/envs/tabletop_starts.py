@@ -42,14 +42,13 @@ class TabletopStarts(GivenStarts):
 
     def order_state(self) -> dict[str, Any]:
         """What decides which initial states the next reset of all rows begins with; take it between waves."""
-        starts = [block.starts.state_dict() for block in self._blocks]
-        return {"seed": self._seed, "episode": torch.tensor(self._episode), "starts": starts}
+        return {"seed": self._seed, "episode": torch.tensor(self._episode)}
 
     def load_order_state(self, state: dict[str, Any]) -> None:
         """Lets the next reset of all rows begin as it would have where :meth:`order_state` gave ``state``."""
         self._seed, self._episode = state["seed"], state["episode"].numpy().copy()
-        for block, starts in zip(self._blocks, state["starts"], strict=True):
-            block.starts.load_state_dict(starts)
+        for block in self._blocks:
+            block.starts.seed(self._seed)
 
     def draw_starts(self) -> TensorDict:
         """Draws what the next reset of all rows would begin with, and counts as that reset; nothing is simulated.
@@ -62,8 +61,7 @@ class TabletopStarts(GivenStarts):
         self._episode[:] = self._episode.max(initial=-1) + 1  # rows reset together stay in step: groups share states
         place = np.zeros(len(self._episode), np.int64)
         for block in self._blocks:
-            order = self._episode[block.rows] * block.num_groups + block.groups
-            place[block.rows] = block.starts.places(order.tolist())
+            place[block.rows] = self._places(block)
         return TensorDict(
             {"place": torch.from_numpy(place), "episode": torch.from_numpy(self._episode.copy())}, self.batch_size
         )
@@ -75,8 +73,11 @@ class TabletopStarts(GivenStarts):
 
     def _drawn(self, block: Block, local: np.ndarray) -> tuple[list[int], np.ndarray]:
         """The next initial states of some of a task's rows."""
+        return block.starts.at(self._places(block, local))
+
+    def _places(self, block: Block, local: np.ndarray | slice = slice(None)) -> list[int]:
         order = self._episode[block.rows[local]] * block.num_groups + block.groups[local]
-        return block.starts.draw_together(order.tolist())
+        return [block.starts.place(number) for number in order.tolist()]
 
     def _given(self, tensordict: TensorDictBase | None, block: Block, rows: np.ndarray) -> tuple[list[int], np.ndarray]:
         """The states of a task's ``rows`` that the caller put into the reset's tensordict."""
