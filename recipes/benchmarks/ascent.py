@@ -40,6 +40,7 @@ from waves import Waves
 from worldenv_trl import keys
 from worldenv_trl.objectives import rloo_advantage
 from worldenv_trl.policies import LaplaceActor, Policy
+from worldenv_trl.record import model_hash
 from worldenv_trl.report import RunRecord
 
 _STEP = 1e-3  # of the finite difference, in the norm of the parameters
@@ -76,6 +77,7 @@ def main(settings: Settings) -> list[tuple[str, Tensor]]:
         actor = exploring_actor(config, policy, factor)
         if not isinstance(actor, LaplaceActor):
             raise ValueError(f"{type(policy).__name__} acts by tokens: directions are measured of Laplace policies")
+    models = model_hash(policy)[:8]
     heads = policy.post_training_parameters(config.post_train.lora_rank)["heads"]
     policy.requires_grad_(False)
     for parameter in heads:
@@ -83,7 +85,10 @@ def main(settings: Settings) -> list[tuple[str, Tensor]]:
     found, names = {}, ("imagined" if settings.imagined else "directions", "held out")
     for name in names:
         world, seed = "imagined" if name == "imagined" else "tabletop", 2 * settings.seed + (name == "held out")
-        kept = f"{settings.policy}_{name}_{settings.waves}_{factor:g}_{seed}".replace(" ", "_")
+        by = models + "".join(
+            model_hash(part())[:8] for part in (run.world_model, run.reflector) if world == "imagined"
+        )
+        kept = f"{name}_{settings.waves}_{factor:g}_{seed}_{by}".replace(" ", "_")
         found[name] = lived(run, policy, actor, world, seed, settings.run / "ascent" / kept)
     shown, held_out = found.values()
     for name, waves in found.items():
@@ -114,7 +119,7 @@ def lived(run: Run, policy: Policy, actor: LaplaceActor, world: str, seed: int, 
         config = dataclasses.replace(run.config, seed=seed)
         config = dataclasses.replace(config, post_train=dataclasses.replace(config.post_train, env=world))
         torch.manual_seed(run.seed("ascent", str(seed)))
-        waves = Waves(dataclasses.replace(run, config=config), "ascent", "", actor, None)
+        waves = Waves(dataclasses.replace(run, config=config), "ascent", "", actor)
         waves.record_next(False)
         decisions = -(-config.max_steps // config.chunk_length)
         parts = [_kept(wave, policy, actor, decisions) for wave, _ in waves]
