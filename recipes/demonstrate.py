@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 
 from config import WorldEnvConfig
@@ -19,7 +20,7 @@ from stages import run_alone
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import ExpertPolicy, context_id
-from worldenv_trl.scenes import goal_places, load_task, spread_states
+from worldenv_trl.scenes import goal_places, load_task, spread_states, usual_states
 
 
 def demonstrate(run: Run) -> None:
@@ -66,8 +67,10 @@ def _starts(config: WorldEnvConfig, number: int) -> dict[str, Any]:
     if config.demonstrate.states == "first":
         return {}
     task = load_task(config.tasks[number])
-    states = task.init_states("train", config.train_states)
-    rows = spread_states(goal_places(task, states), config.demonstrate.episodes_per_task)
+    states, count = task.init_states("train", config.train_states), config.demonstrate.episodes_per_task
+    usual = np.flatnonzero(usual_states(task, states, share=0.5 / count))  # of half a demonstration
+    alike = usual if len(usual) >= count else np.arange(len(states))
+    rows = alike[spread_states(goal_places(task, states[alike]), count)].tolist()
     return {"init_states": states[rows], "context_ids": [context_id(number, "train", row) for row in rows]}
 
 

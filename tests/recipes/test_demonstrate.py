@@ -58,6 +58,22 @@ def test_or_at_those_that_are_spread(tmp_path):
     assert contexts(run) == [context_id(task, "train", row) for task, rows in enumerate(chosen) for row in rows]
 
 
+def test_but_not_at_those_where_the_expert_does_what_it_hardly_ever_does(tmp_path, monkeypatch):
+    rare = np.arange(12) % 3 == 0
+    asked = []
+
+    def usual(task, states, share):
+        asked.append((len(states), share))
+        return ~rare if task.name.endswith(TASKS[0].split("/")[1]) else np.arange(12) < 1  # too few of the second
+
+    monkeypatch.setattr("demonstrate.usual_states", usual)
+    run = demonstrated(tmp_path / "run", "spread")
+    first, second = (places(task, "train", 12) for task in TASKS)
+    rows = [np.flatnonzero(~rare)[spread_states(first[~rare], 2)].tolist(), spread_states(second, 2)]
+    assert contexts(run) == [context_id(task, "train", row) for task, chosen in enumerate(rows) for row in chosen]
+    assert asked == [(12, 0.25)] * 2
+
+
 def test_success_by_distance_from_the_demonstrations(tmp_path, capsys):
     run = demonstrated(tmp_path / "run", "spread")
     run.parts.policy.make(run.config).save_pretrained(run.folder.checkpoint("sft"))

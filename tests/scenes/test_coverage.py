@@ -7,7 +7,15 @@ import itertools
 import numpy as np
 import pytest
 
-from worldenv_trl.scenes import SceneBatch, goal_places, layout_distances, load_task, spread_states
+from worldenv_trl.scenes import (
+    SceneBatch,
+    ScriptedExpert,
+    goal_places,
+    layout_distances,
+    load_task,
+    spread_states,
+    usual_states,
+)
 
 
 def cost(states: np.ndarray, chosen) -> float:
@@ -99,3 +107,34 @@ def test_the_places_are_those_of_the_scene() -> None:
         scene.reset(np.array([0]), states[row : row + 1])
         bodies = [task.build().body(name).id for name in ("milk_1/", "basket_1/")]
         np.testing.assert_allclose(goal_places(task, states)[row], scene.xpos[0, bodies].ravel())
+
+
+def sides_taken(task, states: np.ndarray) -> np.ndarray:
+    """On which side of its middle the expert closes its fingers on the bowl: 0 to 3, quarter turns from x."""
+    scene, expert = SceneBatch(task, len(states), cameras=()), ScriptedExpert(task)
+    scene.reset(np.arange(len(states)), states)
+    bowl, sides, open_since = scene.model.body("bowl_1/").id, np.full(len(states), -1), np.zeros(len(states), bool)
+    for _ in range(60):
+        action = expert(scene)
+        open_since |= action[:, 6] < 0
+        closing = (action[:, 6] > 0) & open_since & (sides < 0)
+        x, y = (scene.measured_state()[:, :2] - scene.xpos[:, bowl, :2]).T
+        sides[closing] = (np.round(np.arctan2(y, x) / (np.pi / 2)).astype(int) % 4)[closing]
+        scene.step(action)
+    return sides
+
+
+def test_usual_states_are_those_where_the_expert_does_what_it_does_in_others() -> None:
+    task = load_task("goal/open_the_top_drawer_and_put_the_bowl_inside")
+    states = task.init_states("train", 40)
+    sides = sides_taken(task, states)
+    counts = np.bincount(sides)
+    assert sorted(counts[counts > 0].tolist()) == [2, 13, 25]
+    for share, least in ((0.04, 2), (0.1, 13), (0.5, 25)):
+        np.testing.assert_array_equal(usual_states(task, states, share), counts[sides] >= least)
+
+
+def test_what_nothing_has_to_be_picked_up_for_is_always_usual() -> None:
+    for name in ("goal/open_the_top_drawer", "goal/push_the_plate_to_the_front_of_the_stove"):
+        task = load_task(name)
+        assert usual_states(task, task.init_states("train", 3), 1.0).all()

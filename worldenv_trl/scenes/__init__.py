@@ -4,7 +4,7 @@ from worldenv_trl.scenes.rendering import RendererPool  # first: where GL is mis
 
 # isort: split
 from worldenv_trl.scenes.catalogue import list_suites, list_tasks, load_task
-from worldenv_trl.scenes.coverage import goal_places, layout_distances, spread_states
+from worldenv_trl.scenes.coverage import goal_places, layout_distances, spread_states, usual_states
 from worldenv_trl.scenes.expert import ScriptedExpert
 from worldenv_trl.scenes.perturbed import PerturbedExpert
 from worldenv_trl.scenes.simulation import SceneBatch
@@ -22,4 +22,5 @@ __all__ = [
     "list_tasks",
     "load_task",
     "spread_states",
+    "usual_states",
 ]

@@ -6,8 +6,9 @@ import numpy as np
 
 from worldenv_trl.scenes.files import FileTask
 from worldenv_trl.scenes.simulation import SceneBatch
+from worldenv_trl.scenes.skills.grips import way_taken
 
-__all__ = ["goal_places", "layout_distances", "spread_states"]
+__all__ = ["goal_places", "layout_distances", "spread_states", "usual_states"]
 
 _MOVES = 1e-3  # m: less is how things settle
 
@@ -29,6 +30,32 @@ def goal_places(task: FileTask, states: np.ndarray) -> np.ndarray:
     scene.reset(np.arange(len(states)), states)
     bodies = [scene.model.body(f"{thing}/").id for thing in things]
     return scene.xpos[:, bodies].reshape(len(states), -1).copy()
+
+
+def usual_states(task: FileTask, states: np.ndarray, share: float) -> np.ndarray:
+    """Bool ``[N]``: integration states ``[N, S]`` in which the expert takes what the goal moves as it does in others.
+
+    It takes a thing another way where something stands in the hand's. One demonstration of what is hardly ever done,
+    beside four of what is, teaches a policy to hesitate.
+
+    Args:
+        share: of the states; ways that are taken in fewer are not usual.
+
+    Examples:
+        >>> from worldenv_trl.scenes import load_task
+        >>> task = load_task("starter/put_the_bowl_on_the_plate")
+        >>> usual_states(task, task.init_states("train", 4), share=0.1)
+        array([ True,  True,  True,  True])
+    """
+    scene = SceneBatch(task, len(states), cameras=())
+    scene.reset(np.arange(len(states)), states)
+    usual = np.ones(len(states), bool)
+    for predicate, thing, *_ in task.goal:
+        grasp = task.entities[thing].grasp if predicate in ("On", "In") else None
+        if grasp is not None:
+            ways = way_taken(scene, task, thing, grasp)
+            usual &= (np.bincount(ways) / len(states) >= share)[ways]
+    return usual
 
 
 def layout_distances(places: np.ndarray, others: np.ndarray, spread_of: np.ndarray | None = None) -> np.ndarray:

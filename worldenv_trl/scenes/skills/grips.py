@@ -36,15 +36,23 @@ def grips(scene: SceneBatch, task: FileTask, thing: str, grasp: Grasp) -> Grips:
         RuntimeError: if the task's things cannot be placed clear of each other.
     """
     ways = _ways(scene, thing, grasp)
+    chosen, rows = _chosen(scene, task, thing, grasp, ways), np.arange(scene.num_envs)
+    points, yaws = np.stack([way[0] for way in ways]), np.stack([way[1] for way in ways])
+    return points[chosen, rows], yaws[chosen, rows]
+
+
+def way_taken(scene: SceneBatch, task: FileTask, thing: str, grasp: Grasp) -> np.ndarray:
+    """Which way :func:`grips` takes ``thing`` in each row: int ``[n]``, a number of the way among those that it has."""
+    return _chosen(scene, task, thing, grasp, _ways(scene, thing, grasp))
+
+
+def _chosen(scene: SceneBatch, task: FileTask, thing: str, grasp: Grasp, ways: list[Grips]) -> np.ndarray:
     if len(ways) == 1:
-        return ways[0]
+        return np.zeros(scene.num_envs, int)
     rooms = _rooms(scene, task, thing, grasp, ways)
     order = list(_usual(task, thing, grasp))
     enough = rooms[order] > _ENOUGH
-    best = np.where(enough.any(0), np.array(order)[enough.argmax(0)], rooms.argmax(0))
-    points, yaws = np.stack([way[0] for way in ways]), np.stack([way[1] for way in ways])
-    rows = np.arange(len(best))
-    return points[best, rows], yaws[best, rows]
+    return np.where(enough.any(0), np.array(order)[enough.argmax(0)], rooms.argmax(0))
 
 
 @cache
