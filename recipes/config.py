@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 GOAL_TASKS = (
@@ -300,6 +300,25 @@ class WorldEnvConfig:
     real_size: RealSize = field(default_factory=RealSize)
 
 
+_IMPROVE = WorldEnvConfig(
+    run_dir=Path("runs/improve"),
+    train_states=150,
+    demonstrate=Demonstrate(states="spread"),
+    sft=SFT(
+        steps=3000,
+        shift_px=0,
+        scene_shift_m=0.025,
+        place_shift_m=0.025,
+        aim_weight=0.5,
+        decision_share=0.5,
+        vision_blocks=(2, 4, 10),
+    ),
+    explore=Explore(episodes_per_task=480),
+    reflector=Reflector(choose_threshold=True, path_steps=800),
+    post_train=PostTrain(iterations=36, lora_rank=0, lora_lr=5e-5, head_lr=5e-5, branch_share=0.6, source_share=0.5),
+)
+
+
 PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
     "smoke": (
         "Every stage for real in at most 6 minutes on 2 cores; too short to improve anything.",
@@ -315,24 +334,17 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
     ),
     "improve": (
         "Meant to raise held-out success (README: how far it does), in at most 60 minutes on 2 cores; extra vision.",
-        WorldEnvConfig(
-            run_dir=Path("runs/improve"),
-            train_states=150,
-            demonstrate=Demonstrate(states="spread"),
-            sft=SFT(
-                steps=3000,
-                shift_px=0,
-                scene_shift_m=0.025,
-                place_shift_m=0.025,
-                aim_weight=0.5,
-                decision_share=0.5,
-                vision_blocks=(2, 4, 10),
-            ),
-            explore=Explore(episodes_per_task=480),
-            reflector=Reflector(choose_threshold=True, path_steps=800),
-            post_train=PostTrain(
-                iterations=36, lora_rank=0, lora_lr=5e-5, head_lr=5e-5, branch_share=0.6, source_share=0.5
-            ),
+        _IMPROVE,
+    ),
+    "thorough": (
+        "`improve` for a suite of ten tasks, with three times the fine-tuning; at most 4 hours; extra vision.",
+        replace(
+            _IMPROVE,
+            run_dir=Path("runs/thorough"),
+            tasks=GOAL_SUITE,
+            max_steps=152,
+            sft=replace(_IMPROVE.sft, steps=9000),
+            evaluate=Evaluate(episodes_per_task=60),
         ),
     ),
     "real-size": (
