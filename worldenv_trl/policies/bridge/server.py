@@ -140,7 +140,7 @@ def serve(act: Act, description: Description, address: str = "127.0.0.1:8765") -
 
     def say(line: str) -> None:
         with contextlib.suppress(OSError):  # nobody reads any more: no reason to leave a client alone
-            print(line, flush=True)
+            print(f"{line}\n", end="", flush=True)  # one write: lines of several clients stay whole
 
     server = PolicyServer(act, description, address, say=say)
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
