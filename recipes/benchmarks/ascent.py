@@ -1,7 +1,7 @@
 """How far uphill LOOP's gradient leads: what a step of its heads is worth to real success.
 
 ``python recipes/benchmarks/ascent.py runs/improve``. Waves of a policy's groups are lived in the physics, sampled as
-LOOP samples them, half to make directions of, half to hold them against; kept in ``RUN/ascent/POLICY``. A direction is
+LOOP samples them, half to make directions of, half to hold them against; kept in ``RUN/ascent``. A direction is
 the mean of the groups' gradients of log-likelihood times advantage over the heads' parameters, of one wave (the mean
 of all that there are is shown) or of all together:
 
@@ -11,19 +11,20 @@ of all that there are is shown) or of all together:
 
 The slope is what real, sampled success rises by along it, to first order, for a unit of sqrt(2 KL) a step: the product
 with the mean gradient of the held-out groups (returns less the baseline: no bias), with 95 % intervals from a bootstrap
-over these groups and over the waves. ``--imagined`` makes the directions of waves of the run's world model and
-reflector instead.
+over these groups, task by task, and over the waves. ``--imagined`` makes the directions of waves of the run's world
+model and reflector instead.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 import tyro
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, pad
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -31,6 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from baseline import LearnedBaseline
 from command_line import at_least, refusals
 from gather_evidence import read_config
+from learning_curves import bootstrap_interval
 from parts import instructions
 from physics import exploring_actor
 from run import Run
@@ -44,6 +46,7 @@ from worldenv_trl.record import model_hash
 from worldenv_trl.report import RunRecord
 
 _STEP = 1e-3  # of the finite difference, in the norm of the parameters
+_LOOKED_AT = 512  # decisions, for the KL of a step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,8 +73,8 @@ def main(settings: Settings) -> list[tuple[str, Tensor]]:
         use_threads(settings.num_threads)
         config = read_config(RunRecord.read(settings.run), settings.num_threads, settings.device)
         factor = config.post_train.scale_factor if settings.scale_factor is None else settings.scale_factor
-        learned = dataclasses.replace(config.post_train, iterations=settings.waves, scale_factor=factor)
-        config = dataclasses.replace(config, post_train=learned)
+        sampled = dataclasses.replace(config.post_train, iterations=settings.waves, scale_factor=factor)
+        config = dataclasses.replace(config, post_train=sampled)
         run = Run(config, RunFolder(settings.run))
         policy = run.policy(settings.policy).eval()
         actor = exploring_actor(config, policy, factor)
@@ -82,39 +85,39 @@ def main(settings: Settings) -> list[tuple[str, Tensor]]:
     policy.requires_grad_(False)
     for parameter in heads:
         parameter.requires_grad_(True)
-    found, names = {}, ("imagined" if settings.imagined else "directions", "held out")
+    drawn, names = {}, ("imagined" if settings.imagined else "directions", "held out")
     for name in names:
         world, seed = "imagined" if name == "imagined" else "tabletop", 2 * settings.seed + (name == "held out")
         by = models + "".join(
             model_hash(part())[:8] for part in (run.world_model, run.reflector) if world == "imagined"
         )
         kept = f"{name}_{settings.waves}_{factor:g}_{seed}_{by}".replace(" ", "_")
-        found[name] = lived(run, policy, actor, world, seed, settings.run / "ascent" / kept)
-    shown, held_out = found.values()
-    for name, waves in found.items():
+        drawn[name] = lived(run, policy, actor, world, seed, settings.run / "ascent" / kept)
+    shown, held_out = drawn.values()
+    for name, waves in drawn.items():
         if not (waves["returns"].std(1) > 0).any():
             refused = f"{name}: rollouts of a group end alike (mean return {waves['returns'].mean():.3f}): no slope"
             raise SystemExit(f"{refused}; take more waves or another scale_factor")
     print(f"{names[0]}: mean return {shown['returns'].mean():.3f}, held out: {held_out['returns'].mean():.3f}")
-    truth = gradients(actor, held_out, judged(run, policy, held_out, 1.0), heads) / held_out.shape[1]
+    (truth,) = gradients(actor, held_out, [judged(run, policy, held_out, 1.0)], heads)
+    leave_one_out = rloo_advantage(shown["returns"][:, :, 0]).unsqueeze(-1).expand(shown.shape)
+    learned = judged(run, policy, shown, config.post_train.baseline_lambda)
+    found = gradients(actor, shown, [leave_one_out, learned], heads)
     print("\n| advantage | groups | step | slope |\n|---|---|---|---|")
-    rows, wave = [], config.post_train.groups
-    for name, advantage in (
-        ("leave-one-out", rloo_advantage(shown["returns"][:, :, 0]).unsqueeze(-1).expand(shown.shape)),
-        ("learned baseline", judged(run, policy, shown, config.post_train.baseline_lambda)),
-    ):
-        each = gradients(actor, shown, advantage, heads)
+    rows, wave, tasks = [], config.post_train.groups, held_out[keys.TASK_ID][:, 0, 0, 0].numpy()
+    for name, each in zip(("leave-one-out", "learned baseline"), found, strict=True):
         for count in sorted({wave, len(each)}):
             for step, made in (("plain", lambda part: part.mean(0)), ("Adam's", _scaled)):
-                directions = [made(part) for part in each.split(count)]
-                slopes = torch.stack([truth @ way / width(policy, held_out, way, heads) for way in directions])
+                ways = torch.stack([made(part) for part in each.split(count)])
+                slopes = ways @ truth.T / held_out.shape[1] / widths(policy, held_out, ways, heads).unsqueeze(-1)
+                low, high = bootstrap_interval(slopes.numpy(), tasks)
                 rows.append((f"{name} | {count} | {step}", slopes))
-                print(f"| {rows[-1][0]} | {_interval(slopes)} |", flush=True)
+                print(f"| {rows[-1][0]} | {slopes.mean():.3f} [{low:.3f}, {high:.3f}] |", flush=True)
     return rows
 
 
 def lived(run: Run, policy: Policy, actor: LaplaceActor, world: str, seed: int, folder: Path) -> TensorDict:
-    """Groups [G, N, T] of the policy with what it saw, did and reached, ``returns`` [G, N]; made once, then read."""
+    """Groups [G, N, T] of the policy: what it saw and did, and ``returns``, alike at all decisions. Made once."""
     if not folder.is_dir():
         config = dataclasses.replace(run.config, seed=seed)
         config = dataclasses.replace(config, post_train=dataclasses.replace(config.post_train, env=world))
@@ -122,7 +125,7 @@ def lived(run: Run, policy: Policy, actor: LaplaceActor, world: str, seed: int, 
         waves = Waves(dataclasses.replace(run, config=config), "ascent", "", actor)
         waves.record_next(False)
         decisions = -(-config.max_steps // config.chunk_length)
-        parts = [_kept(wave, policy, actor, decisions) for wave, _ in waves]
+        parts = [_kept(wave, policy, decisions) for wave, _ in waves]
         waves.shutdown()
         torch.cat(parts).memmap(folder)
     waves = TensorDict.load_memmap(folder)
@@ -130,15 +133,11 @@ def lived(run: Run, policy: Policy, actor: LaplaceActor, world: str, seed: int, 
     return torch.stack([group.set(keys.INSTRUCTION, text) for group, text in zip(waves, texts, strict=True)])
 
 
-def _kept(wave: TensorDictBase, policy: Policy, actor: LaplaceActor, decisions: int) -> TensorDict:
+def _kept(wave: TensorDictBase, policy: Policy, decisions: int) -> TensorDict:
     """What is read of a wave, padded to ``decisions``. Numbers alone: the text is the task's."""
-    kept = TensorDict(batch_size=[*wave.shape[:2], decisions])
-    names = [*(key for key in policy.in_keys if key != keys.INSTRUCTION), keys.CHUNK, keys.MASK]
-    for key in [*names, keys.TASK_ID, keys.NUM_STEPS, ("next", keys.STEP_MASK), keys.SCALE]:
-        value = wave[key]
-        padded = value.new_zeros(*value.shape[:2], decisions, *value.shape[3:])
-        padded[:, :, : value.shape[2]] = value
-        kept[key] = padded
+    names = [*(key for key in policy.in_keys if key != keys.INSTRUCTION), keys.CHUNK, keys.MASK, keys.SCALE]
+    named = wave.select(*names, keys.TASK_ID, keys.NUM_STEPS, ("next", keys.STEP_MASK))
+    kept = pad(named, [0, 0, 0, 0, 0, decisions - wave.shape[2]])
     kept["returns"] = wave["returns"][:, :, :1].expand(*wave.shape[:2], decisions)
     return kept
 
@@ -150,17 +149,22 @@ def judged(run: Run, policy: Policy, waves: TensorDictBase, lmbda: float) -> Ten
     return baseline.advantage(waves, waves["returns"][:, :, 0])
 
 
-def gradients(actor: LaplaceActor, waves: TensorDictBase, advantage: Tensor, heads: list[torch.nn.Parameter]) -> Tensor:
-    """[G, P], of each group: the gradient of the sum over its executed steps of log-likelihood times advantage."""
-    found = []
-    for group, each in zip(waves, advantage, strict=True):
+def gradients(
+    actor: LaplaceActor, waves: TensorDictBase, advantages: Sequence[Tensor], heads: list[torch.nn.Parameter]
+) -> list[Tensor]:
+    """For each of the advantages [G, N, T], of each group the gradient [G, P] of the sum over its executed steps of
+    log-likelihood times advantage."""
+    found: list[list[Tensor]] = [[] for _ in advantages]
+    for number, group in enumerate(waves):
         mask = group[keys.MASK]
         decisions = group[mask]
-        steps = decisions["next", keys.STEP_MASK]
         log_probs = actor.get_dist(decisions.clone()).log_prob(decisions[keys.CHUNK])  # [M, C]
-        total = (torch.where(steps, log_probs, 0.0) * each[mask].to(log_probs).unsqueeze(-1)).sum()
-        found.append(torch.cat([part.flatten() for part in torch.autograd.grad(total, heads)]))
-    return torch.stack(found)
+        likelihood = torch.where(decisions["next", keys.STEP_MASK], log_probs, 0.0).sum(-1)
+        for each, advantage in zip(found, advantages, strict=True):
+            total = likelihood @ advantage[number][mask].to(likelihood)
+            parts = torch.autograd.grad(total, heads, retain_graph=True)
+            each.append(torch.cat([part.flatten() for part in parts]))
+    return [torch.stack(each) for each in found]
 
 
 def _scaled(each: Tensor) -> Tensor:
@@ -170,35 +174,27 @@ def _scaled(each: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def width(policy: Policy, waves: TensorDictBase, direction: Tensor, heads: list[torch.nn.Parameter]) -> float:
-    """How far a unit of ``direction`` moves the policy: the root of twice the KL that it comes to per step.
+def widths(policy: Policy, waves: TensorDictBase, ways: Tensor, heads: list[torch.nn.Parameter]) -> Tensor:
+    """How far a unit of each direction [K, P] moves the policy: [K], the root of twice the KL that it comes to a step.
 
-    Of a Laplace density that is the mean's change in units of its scale, root mean square summed over dimensions.
+    Of a Laplace density that is the mean's change in units of its scale, root mean square, summed over dimensions.
     """
-    some = waves[:: max(1, len(waves) // 24)]
-    decisions = some[some[keys.MASK]]
+    decisions = waves[waves[keys.MASK]]
+    decisions = decisions[:: max(1, len(decisions) // _LOOKED_AT)]
     steps, scale = decisions["next", keys.STEP_MASK].unsqueeze(-1), decisions[keys.SCALE]
-    unit = _STEP / direction.norm()
-    before = policy(decisions.clone())[keys.LOC]
-    _move(heads, unit * direction)
-    after = policy(decisions.clone())[keys.LOC]
-    _move(heads, -unit * direction)
-    moved = ((after - before) / scale * steps).square().sum() / steps.sum()
-    return (moved.sqrt() / unit).item()
+    before, found = policy(decisions.clone())[keys.LOC], []
+    for way in ways:
+        unit = _STEP / way.norm()
+        _move(heads, unit * way)
+        moved = (policy(decisions.clone())[keys.LOC] - before) / scale * steps
+        _move(heads, -unit * way)
+        found.append((moved.square().sum() / steps.sum()).sqrt() / unit)
+    return torch.stack(found)
 
 
 def _move(heads: list[torch.nn.Parameter], by: Tensor) -> None:
     for parameter, part in zip(heads, by.split([each.numel() for each in heads]), strict=True):
         parameter.add_(part.view_as(parameter))
-
-
-def _interval(slopes: Tensor, resamples: int = 1000) -> str:
-    """Of slopes [directions, held-out groups]; both are drawn anew."""
-    generator = torch.Generator().manual_seed(0)
-    ways, groups = (torch.randint(count, (resamples, count), generator=generator) for count in slopes.shape)
-    means = torch.stack([slopes[way][:, group].mean() for way, group in zip(ways, groups, strict=True)])
-    low, high = torch.quantile(means, torch.tensor([0.025, 0.975])).tolist()
-    return f"{slopes.mean():.3f} [{low:.3f}, {high:.3f}]"
 
 
 if __name__ == "__main__":

@@ -66,7 +66,8 @@ def test_gradients_point_where_the_expected_return_rises(policy, heads):
     waves = lived(policy)
     weights = torch.randn(waves[keys.CHUNK].shape[-2:])
     told = [((waves[key] * weights).sum(-1) * executed(waves)).sum(-1) for key in (keys.CHUNK, keys.LOC)]
-    each = ascent.gradients(policy_actor(policy), waves, told[0] - told[1], heads)
+    each, none = ascent.gradients(policy_actor(policy), waves, [told[0] - told[1], torch.zeros(G, N, T)], heads)
+    assert not none.any()
     assert each.shape == (G, sum(parameter.numel() for parameter in heads))
     loc = policy(waves.clone())[keys.LOC]
     truth = torch.cat(
@@ -80,7 +81,8 @@ def test_gradients_point_where_the_expected_return_rises(policy, heads):
 def test_a_unit_is_the_root_of_twice_the_kl_of_a_step(policy, heads):
     waves, direction = lived(policy), torch.randn(sum(parameter.numel() for parameter in heads))
     before = [parameter.detach().clone() for parameter in heads]
-    width = ascent.width(policy, waves, direction, heads)
+    width, double = ascent.widths(policy, waves, torch.stack([direction, 2 * direction]), heads).tolist()
+    assert double == pytest.approx(2 * width, rel=0.01)
     assert all(torch.allclose(*pair) for pair in zip(before, heads, strict=True))
     wide, old, size = executed(waves)[::2], waves[::2], 0.01 / width
     with torch.no_grad():
