@@ -174,12 +174,14 @@ def test_a_stage_without_its_input_names_the_stage_to_run(tiny):
         rerun("sft", world_env.WORKS["sft"], run)
 
 
-def test_thorough_is_improve_on_a_suite_with_more_fine_tuning():
+def test_thorough_is_improve_on_a_suite_with_more_training():
     improve, thorough = (PRESETS[name][1] for name in ("improve", "thorough"))
     changed = {
         item.name for item in dataclasses.fields(improve) if getattr(improve, item.name) != getattr(thorough, item.name)
     }
-    assert changed == {"run_dir", "tasks", "max_steps", "sft", "evaluate"}
+    assert changed == {"run_dir", "tasks", "max_steps", "sft", "reflector", "evaluate"}
     assert dataclasses.replace(thorough.sft, steps=improve.sft.steps) == improve.sft
-    assert thorough.sft.steps > improve.sft.steps and len(thorough.tasks) == 10
+    assert dataclasses.replace(thorough.reflector, path_steps=improve.reflector.path_steps) == improve.reflector
+    shares = [(each.sft.steps, each.reflector.path_steps) for each in (improve, thorough)]
+    assert all(more == 3 * less for less, more in zip(*shares, strict=True)) and len(thorough.tasks) == 10
     check_config(dataclasses.replace(thorough, sft=dataclasses.replace(thorough.sft, vision_blocks=())))
