@@ -69,7 +69,6 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         raise ValueError(f"tasks names a task twice: {', '.join(config.tasks)}")
     for name, value, known in (
         ("post_train.env", config.post_train.env, ("imagined", "tabletop")),
-        ("post_train.baseline", config.post_train.baseline, ("group", "learned")),
         ("post_train.ratio_level", config.post_train.ratio_level, ("step", "chunk", "token")),
         ("parallel", config.parallel, MODES),
         ("demonstrate.actions", config.demonstrate.actions, ACTIONS),
@@ -156,7 +155,6 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         ("reflector.imagined_share", config.reflector.imagined_share),
         ("reflector.holdout", config.reflector.holdout),
         ("post_train.branch_share", config.post_train.branch_share),
-        ("post_train.baseline_lambda", config.post_train.baseline_lambda),
         ("post_train.averaging", config.post_train.averaging),
         ("post_train.source_share", config.post_train.source_share),
     ):

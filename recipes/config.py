@@ -154,12 +154,6 @@ class PostTrain:
     physics."""
     branch_until: int = 40
     """The last step at which they begin."""
-    baseline: str = "group"
-    """What a return is held against: ``group``, the other returns of its group (World-Env Eq. 4), the same for all
-    decisions of a rollout; or ``learned``, at each decision the return that is to be expected there, learned from the
-    waves so far."""
-    baseline_lambda: float = 0.7
-    """Of the learned one: 1 credits a decision with all that comes after it, 0 with what changes until the next."""
     epochs: int = 4
     minibatch_size: int = 256
     momentum: float = 0.9

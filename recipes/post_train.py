@@ -16,7 +16,6 @@ from tensordict import TensorDictBase
 
 import processes
 from averaging import RunningMean
-from baseline import LearnedBaseline
 from data_parallel import DataParallel, WholeOptimizer
 from physics import exploring_actor, recording
 from probes import probe, probed_iterations, warning
@@ -93,9 +92,8 @@ def post_train(
     probed, recorded = probed_iterations(settings), {0, settings.iterations - 1}
     alarm = HonestyAlarm(len(probed), false_alarm_rate=settings.false_alarm_rate) if probed and imagination else None
     counts = {"stuck": 0}
-    baseline = LearnedBaseline(policy, config) if settings.baseline == "learned" else None
     learning: dict[str, Any] = {"collector": waves.collector, "optimizer": WholeOptimizer(optimizer)}
-    learning |= {"mean": mean, "alarm": alarm, "counts": counts, "baseline": baseline}
+    learning |= {"mean": mean, "alarm": alarm, "counts": counts}
     left = Resumable(run, "iterations", settings.iterations, **learning)
     learner.scatter()
     waves.record_next(left.step in recorded)
@@ -108,13 +106,9 @@ def post_train(
         for group, rate in zip(optimizer.param_groups, full_rates, strict=True):
             group["lr"] = factor * rate
         returns = processes.gathered(returns_of(mine))  # [G, N], of all processes
-        if baseline is None:
-            advantage = rloo_advantage(returns)
-            if settings.standardize:
-                advantage = advantage / advantage.std().clamp_min(1e-6)
-            advantage = advantage.unsqueeze(-1)  # the same at every decision
-        else:
-            advantage = baseline.advantage(mine, returns)
+        advantage = rloo_advantage(returns)
+        if settings.standardize:
+            advantage = advantage / advantage.std().clamp_min(1e-6)
         mine[keys.ADVANTAGE] = _at_decisions(processes.own_rows_of(advantage), mine)
         about = {}
         if iteration in recorded and processes.is_main():  # of the weights that collected it
@@ -133,8 +127,6 @@ def post_train(
         waves.update_policy_weights_()
 
         metrics |= _wave_metrics(mine, returns, config.tasks)
-        if baseline is not None:
-            metrics["explained"] = baseline.explained
         if imagination is not None and imagination.branch_points is not None:
             metrics["branched"] = processes.gathered(mine[keys.NUM_STEPS][:, 0, 0, 0] > 0).float().mean().item()
         metrics["iteration_seconds"], started = time.monotonic() - started, time.monotonic()
@@ -157,8 +149,8 @@ def post_train(
 
 
 def _at_decisions(advantage: torch.Tensor, wave: TensorDictBase) -> torch.Tensor:
-    """[G, N, T, 1] of advantages [G, N, 1], or of as many decisions as a rollout can have."""
-    return advantage[..., : wave.shape[-1], None].expand(*wave.shape, 1)
+    """[G, N, T, 1] of advantages [G, N]: the same at every decision."""
+    return advantage[..., None, None].expand(*wave.shape, 1)
 
 
 def _write(run: Run, name: str, about: dict, wave: TensorDictBase, aside: FramesAside | None) -> None:

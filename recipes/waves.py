@@ -30,7 +30,6 @@ _LEARNED_FROM = (
     keys.MASK,
     keys.TASK_ID,
     keys.CONTEXT_ID,
-    keys.NUM_STEPS,
     "returns",
     ("next", keys.STEP_MASK),
     ("next", "terminated"),

@@ -2,24 +2,19 @@
 
 ``python recipes/benchmarks/ascent.py runs/improve``. Waves of a policy's groups are lived in the physics, sampled as
 LOOP samples them, half to make directions of, half to hold them against; kept in ``RUN/ascent``. A direction is
-the mean of the groups' gradients of log-likelihood times advantage over the heads' parameters, of one wave (the mean
-of all that there are is shown) or of all together:
-
-- advantage: leave-one-out, or over a learned baseline (``recipes/baseline.py``), each half of the groups judged by what
-  the other half teaches;
-- plain, or each parameter's mean divided by its root mean square over the groups, as Adam does.
+the mean of the groups' gradients of log-likelihood times leave-one-out advantage over the heads' parameters, of one
+wave (the mean of all that there are is shown) or of all together: plain, or each parameter's mean divided by its root
+mean square over the groups, as Adam does.
 
 The slope is what real, sampled success rises by along it, to first order, for a unit of sqrt(2 KL) a step: the product
-with the mean gradient of the held-out groups (returns less the baseline: no bias), with 95 % intervals from a bootstrap
-over these groups, task by task, and over the waves. ``--imagined`` makes the directions of waves of the run's world
-model and reflector instead.
+with the mean gradient of the held-out groups, with 95 % intervals from a bootstrap over these groups, task by task, and
+over the waves. ``--imagined`` makes the directions of waves of the run's world model and reflector instead.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -29,7 +24,6 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from baseline import LearnedBaseline
 from command_line import at_least, refusals
 from gather_evidence import read_config
 from learning_curves import bootstrap_interval
@@ -99,20 +93,16 @@ def main(settings: Settings) -> list[tuple[str, Tensor]]:
             refused = f"{name}: rollouts of a group end alike (mean return {waves['returns'].mean():.3f}): no slope"
             raise SystemExit(f"{refused}; take more waves or another scale_factor")
     print(f"{names[0]}: mean return {shown['returns'].mean():.3f}, held out: {held_out['returns'].mean():.3f}")
-    (truth,) = gradients(actor, held_out, [judged(run, policy, held_out, 1.0)], heads)
-    leave_one_out = rloo_advantage(shown["returns"][:, :, 0]).unsqueeze(-1).expand(shown.shape)
-    learned = judged(run, policy, shown, config.post_train.baseline_lambda)
-    found = gradients(actor, shown, [leave_one_out, learned], heads)
-    print("\n| advantage | groups | step | slope |\n|---|---|---|---|")
+    found, truth = (gradients(actor, waves, leave_one_out(waves), heads) for waves in (shown, held_out))
+    print("\n| groups | step | slope |\n|---|---|---|")
     rows, wave, tasks = [], config.post_train.groups, held_out[keys.TASK_ID][:, 0, 0, 0].numpy()
-    for name, each in zip(("leave-one-out", "learned baseline"), found, strict=True):
-        for count in sorted({wave, len(each)}):
-            for step, made in (("plain", lambda part: part.mean(0)), ("Adam's", _scaled)):
-                ways = torch.stack([made(part) for part in each.split(count)])
-                slopes = ways @ truth.T / held_out.shape[1] / widths(policy, held_out, ways, heads).unsqueeze(-1)
-                low, high = bootstrap_interval(slopes.numpy(), tasks)
-                rows.append((f"{name} | {count} | {step}", slopes))
-                print(f"| {rows[-1][0]} | {slopes.mean():.3f} [{low:.3f}, {high:.3f}] |", flush=True)
+    for count in sorted({wave, len(found)}):
+        for step, made in (("plain", lambda part: part.mean(0)), ("Adam's", _scaled)):
+            ways = torch.stack([made(part) for part in found.split(count)])
+            slopes = ways @ truth.T / held_out.shape[1] / widths(policy, held_out, ways, heads).unsqueeze(-1)
+            low, high = bootstrap_interval(slopes.numpy(), tasks)
+            rows.append((f"{count} | {step}", slopes))
+            print(f"| {rows[-1][0]} | {slopes.mean():.3f} [{low:.3f}, {high:.3f}] |", flush=True)
     return rows
 
 
@@ -136,35 +126,31 @@ def lived(run: Run, policy: Policy, actor: LaplaceActor, world: str, seed: int, 
 def _kept(wave: TensorDictBase, policy: Policy, decisions: int) -> TensorDict:
     """What is read of a wave, padded to ``decisions``. Numbers alone: the text is the task's."""
     names = [*(key for key in policy.in_keys if key != keys.INSTRUCTION), keys.CHUNK, keys.MASK, keys.SCALE]
-    named = wave.select(*names, keys.TASK_ID, keys.NUM_STEPS, ("next", keys.STEP_MASK))
+    named = wave.select(*names, keys.TASK_ID, ("next", keys.STEP_MASK))
     kept = pad(named, [0, 0, 0, 0, 0, decisions - wave.shape[2]])
     kept["returns"] = wave["returns"][:, :, :1].expand(*wave.shape[:2], decisions)
     return kept
 
 
-def judged(run: Run, policy: Policy, waves: TensorDictBase, lmbda: float) -> Tensor:
-    """Advantages [G, N, T] over a baseline; each half of the groups is judged by what the other half teaches."""
-    settings = dataclasses.replace(run.config.post_train, baseline_lambda=lmbda, standardize=False)
-    baseline = LearnedBaseline(policy, dataclasses.replace(run.config, post_train=settings))
-    return baseline.advantage(waves, waves["returns"][:, :, 0])
+def leave_one_out(waves: TensorDictBase) -> Tensor:
+    """LOOP's advantages [G, N, T], the same at all decisions."""
+    return rloo_advantage(waves["returns"][:, :, 0]).unsqueeze(-1).expand(waves.shape)
 
 
 def gradients(
-    actor: LaplaceActor, waves: TensorDictBase, advantages: Sequence[Tensor], heads: list[torch.nn.Parameter]
-) -> list[Tensor]:
-    """For each of the advantages [G, N, T], of each group the gradient [G, P] of the sum over its executed steps of
-    log-likelihood times advantage."""
-    found: list[list[Tensor]] = [[] for _ in advantages]
-    for number, group in enumerate(waves):
+    actor: LaplaceActor, waves: TensorDictBase, advantages: Tensor, heads: list[torch.nn.Parameter]
+) -> Tensor:
+    """Of each group the gradient [G, P] of the sum over its executed steps of log-likelihood times advantage
+    [G, N, T]."""
+    found = []
+    for group, advantage in zip(waves, advantages, strict=True):
         mask = group[keys.MASK]
         decisions = group[mask]
         log_probs = actor.get_dist(decisions.clone()).log_prob(decisions[keys.CHUNK])  # [M, C]
         likelihood = torch.where(decisions["next", keys.STEP_MASK], log_probs, 0.0).sum(-1)
-        for each, advantage in zip(found, advantages, strict=True):
-            total = likelihood @ advantage[number][mask].to(likelihood)
-            parts = torch.autograd.grad(total, heads, retain_graph=True)
-            each.append(torch.cat([part.flatten() for part in parts]))
-    return [torch.stack(each) for each in found]
+        parts = torch.autograd.grad(likelihood @ advantage[mask].to(likelihood), heads)
+        found.append(torch.cat([part.flatten() for part in parts]))
+    return torch.stack(found)
 
 
 def _scaled(each: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from worldenv_trl.policies.action_tokens import QuantileActionTokenizer
 from worldenv_trl.policies.actor import LaplaceActor, laplace_actor, likelihood_actor, policy_actor, scale_bounds
 from worldenv_trl.policies.augmentation import random_shift
 from worldenv_trl.policies.autoregressive import AutoregressiveActor, TeacherForcing, token_cross_entropy
-from worldenv_trl.policies.base import Aims, Hidden, Policy
+from worldenv_trl.policies.base import Aims, Policy
 from worldenv_trl.policies.device_bridge import DeviceBridge
 from worldenv_trl.policies.external import ExternalConfig, ExternalPolicy
 from worldenv_trl.policies.fast import FASTConfig, FASTPolicy
@@ -40,7 +40,6 @@ __all__ = [
     "HFPolicy",
     "HFTokenConfig",
     "HFTokenPolicy",
-    "Hidden",
     "IndependentCategorical",
     "IndependentLaplace",
     "LaplaceActor",

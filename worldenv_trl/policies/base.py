@@ -168,15 +168,6 @@ class Aims(Protocol):
         ...
 
 
-@runtime_checkable
-class Hidden(Protocol):
-    """A policy that gives away what its heads read: what it makes of an observation."""
-
-    def hidden(self, images: Mapping[str, Tensor], state: Tensor, instructions: Sequence[str]) -> Tensor:
-        """Float32 [n, F] of what :meth:`Policy.predict` takes."""
-        ...
-
-
 def check_rank(rank: int, present: int) -> None:
     """Raises ``ValueError`` for adapters of a negative rank, or of another than a policy has (``present``; 0: none)."""
     if rank < 0:

@@ -204,18 +204,6 @@ class FlowPolicy(Policy, Pretrained):
     def predict(
         self, images: Mapping[str, Tensor], state: Tensor, instructions: Sequence[str]
     ) -> tuple[Tensor, Tensor]:
-        actions, hidden = self._denoised(images, state, instructions)
-        loc = actions[:, : self.chunk_length, :ACTION_DIM] * self.action_gain + self.action_center
-        return loc, self.scale_head(hidden)
-
-    def hidden(self, images: Mapping[str, Tensor], state: Tensor, instructions: Sequence[str]) -> Tensor:
-        """See :class:`~worldenv_trl.policies.Hidden`: the mean of the last pass's actions, [n, width]."""
-        return self._denoised(images, state, instructions)[1].mean(1)
-
-    def _denoised(
-        self, images: Mapping[str, Tensor], state: Tensor, instructions: Sequence[str]
-    ) -> tuple[Tensor, Tensor]:
-        """Normalised actions [n, horizon, D], and hidden states [n, C, width] of the last pass."""
         config, network = self.config, self.network
         pixels = torch.stack([images[camera] for camera in self.cameras], 1)  # [n, cameras, 3, H, W]
         pixels = bilinear_resize(pixels.flip(-1) if config.mirror else pixels, config.resolution)
@@ -229,7 +217,8 @@ class FlowPolicy(Policy, Pretrained):
             with autocast(state.device, self._dtype):
                 hidden = network.hidden(prefix, padded, actions, 1 - step / config.num_steps)
             actions = actions - network.velocity(hidden) / config.num_steps
-        return actions, hidden[:, : self.chunk_length].float()
+        loc = actions[:, : self.chunk_length, :ACTION_DIM] * self.action_gain + self.action_center
+        return loc, self.scale_head(hidden[:, : self.chunk_length].float())
 
     @torch.no_grad()
     def fit_statistics(self, states: Tensor, actions: Tensor) -> None:

@@ -101,22 +101,15 @@ class HFPolicy(VisionLanguagePolicy):
     def predict(
         self, images: Mapping[str, Tensor], state: Tensor, instructions: Sequence[str]
     ) -> tuple[Tensor, Tensor]:
-        hidden = self._encoded(images, state, instructions)
-        hidden = hidden.unflatten(1, (self.chunk_length, ACTION_DIM)).flatten(2)  # [n, C, 7 * dim]
-        return self.loc_head(hidden) * self.action_gain + self.action_center, self.scale_head(hidden)
-
-    def hidden(self, images: Mapping[str, Tensor], state: Tensor, instructions: Sequence[str]) -> Tensor:
-        """See :class:`~worldenv_trl.policies.Hidden`: the mean of the actions' tokens, [n, dim]."""
-        return self._encoded(images, state, instructions).mean(1)
-
-    def _encoded(self, images: Mapping[str, Tensor], state: Tensor, instructions: Sequence[str]) -> Tensor:
-        """The actions' tokens, [n, C * 7, dim]."""
         pixels = self._pixels(images)
         ids, valid = self._prompt_tensors(instructions)
         proprio = self._normalized_proprio(state)
         with autocast(state.device, self._dtype):
-            hidden = self.backbone(pixels, self.proprio_projector(proprio), ids, valid, self.chunk_length * ACTION_DIM)
-        return hidden.float()
+            hidden = self.backbone(
+                pixels, self.proprio_projector(proprio), ids, valid, self.chunk_length * ACTION_DIM
+            )  # [n, C * 7, dim]
+        hidden = hidden.float().unflatten(1, (self.chunk_length, ACTION_DIM)).flatten(2)  # [n, C, 7 * dim]
+        return self.loc_head(hidden) * self.action_gain + self.action_center, self.scale_head(hidden)
 
     def scale_parameters(self) -> list[nn.Parameter]:
         return list(self.scale_head.parameters())

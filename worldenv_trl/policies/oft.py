@@ -306,23 +306,14 @@ class OFTPolicy(Policy, Pretrained):
     def predict(
         self, images: Mapping[str, Tensor], state: Tensor, instructions: Sequence[str]
     ) -> tuple[Tensor, Tensor]:
-        hidden, places, aims = self._encoded(images, state, instructions)
+        words = self._words(instructions)
+        seen = [images[camera] for camera in self.cameras]
+        hidden, places, aims = self.backbone(seen, (state - self.state_center) / self.state_half_range, words)
         if self._aims is not None:
             log_probs = (maps.flatten(1).log_softmax(-1).view_as(maps) for maps in aims)
             self._aims.update(zip(self.cameras, log_probs, strict=True))
         loc = self.loc_head(hidden) + self.follow_head(hidden, places)  # hidden is [n, C, dim]
         return loc * self.action_range + self.action_center, self.scale_head(hidden)
-
-    def hidden(self, images: Mapping[str, Tensor], state: Tensor, instructions: Sequence[str]) -> Tensor:
-        """See :class:`~worldenv_trl.policies.Hidden`: the action queries, and where keypoints and hand are."""
-        hidden, places, _ = self._encoded(images, state, instructions)
-        return torch.cat([hidden.flatten(1), places], -1)
-
-    def _encoded(
-        self, images: Mapping[str, Tensor], state: Tensor, instructions: Sequence[str]
-    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        seen = [images[camera] for camera in self.cameras]
-        return self.backbone(seen, (state - self.state_center) / self.state_half_range, self._words(instructions))
 
     @contextmanager
     def aiming(self) -> Iterator[dict[str, Tensor]]:
