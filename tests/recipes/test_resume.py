@@ -170,12 +170,15 @@ def test_imagined_episodes_continue_batch_by_batch(straight, tmp_path, monkeypat
     assert not list((runs[1].folder.path / "resume").iterdir())
 
 
-def test_loop_in_the_physics_continues_to_the_same_weights(straight, tmp_path, monkeypatch):
-    learned = dataclasses.replace(SETTINGS.post_train, env="tabletop", probe_every=2)
+def test_loop_of_the_heads_in_the_physics_continues_to_the_same_weights(straight, tmp_path, monkeypatch):
+    learned = dataclasses.replace(SETTINGS.post_train, env="tabletop", probe_every=2, lora_rank=0, lora_lr=0.0)
+
+    def returns_of(wave):  # that differ: untrained actions all fail, and teach nothing
+        return wave[keys.CHUNK][:, :, 0].mean((-2, -1))
 
     def loop(run):
         with run.folder.stage("post_train"):
-            post_train(run, "sft", "post_train", "")
+            post_train(run, "sft", "post_train", "", returns_of=returns_of)
 
     runs = [copy_of(straight, tmp_path / name, post_train=learned) for name in ("straight", "broken")]
     for run in runs:
@@ -192,6 +195,9 @@ def test_loop_in_the_physics_continues_to_the_same_weights(straight, tmp_path, m
     weights = [files(run.folder.checkpoint("post_train")) for run in runs]
     assert weights[0] == weights[1] and weights[0] != files(straight / "checkpoints" / "post_train")
     assert metrics(runs[0].folder, "post_train") == metrics(runs[1].folder, "post_train")
+    before, after = (runs[0].policy(name).state_dict() for name in ("sft", "post_train"))
+    moved = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
+    assert moved == {"loc_head", "follow_head", "scale_head"}
 
 
 def test_an_earlier_stage_that_runs_again_takes_the_checkpoints_of_the_later_ones(straight, tmp_path, monkeypatch):
