@@ -129,8 +129,9 @@ class Reflector:
     """Share of the training episodes that are imagined replays of recorded actions, labelled by the physics."""
     path_steps: int = 0
     """Steps of a second reflector, which judges in imagination by where the hand goes over the first frame; none when
-    0. The first one then judges real frames alone, and no imagined episodes are made for it. A batch is shared by the
-    tasks: ten want three times what three do."""
+    0. Half as many come before, in which it finds the places that matter there. The first one then judges real frames
+    alone, and no imagined episodes are made for it. A batch is shared by the tasks: ten want three times what three
+    do."""
     holdout: float = 0.2
     """Share of the exploration's initial states kept out, for the figures and for the choice of the stopping rule."""
     threshold: float = 0.5

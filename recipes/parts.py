@@ -130,7 +130,9 @@ def make_reflector(config: WorldEnvConfig) -> CompactReflector | DualReflector:
             )
         path = PathReflectorConfig.for_cameras(cameras, image_size=config.image_size)
         reflector = DualReflector(
-            DualReflectorConfig(video, path), lessons, PathLessons(steps=settings.path_steps, lr=settings.lr)
+            DualReflectorConfig(video, path),
+            lessons,
+            PathLessons(steps=settings.path_steps, place_steps=-(-settings.path_steps // 2), lr=settings.lr),
         )
     if settings.vision_blocks:
         load_vision(reflector, config.vision_weights)

@@ -185,7 +185,10 @@ class Pretrained(_Module):
         try:
             module.load_state_dict(safetensors.torch.load(weights))
         except (safetensors.SafetensorError, RuntimeError) as error:
-            raise ValueError(f"{folder / WEIGHTS_NAME} does not hold the weights of its config: {error}") from error
+            raise ValueError(
+                f"{folder / WEIGHTS_NAME} does not hold the weights of its config; if another version of worldenv_trl "
+                f"saved it, train this part again: {error}"
+            ) from error
         return module.to(device)
 
 

@@ -26,12 +26,13 @@ def test_the_reflector_judges_there_as_here(gpu):
     near(scores[1], scores[0])
 
 
-def test_its_lesson_is_drawn_and_learned_there(gpu):
-    reflector = make(lessons=PathLessons(steps=1, batch_size=8)).to(gpu)
-    (lesson,) = reflector.train_on(touching(8, 0))
-    batch = lesson.sample()
-    assert all(value.device.type == "cuda" for value in batch.values())
-    loss = ReflectorLoss(reflector)(batch)["loss_reflector"]
-    loss.backward()
+def test_its_lessons_are_drawn_and_learned_there(gpu):
+    reflector, names = make(lessons=PathLessons(steps=1, place_steps=1, batch_size=8)).to(gpu), []
+    for lesson in reflector.train_on(touching(8, 0)):
+        batch = lesson.sample()
+        assert all(value.device.type == "cuda" for value in batch.values())
+        ReflectorLoss(reflector)(batch)["loss_reflector"].backward()
+        names.append(lesson.name)
+    assert names == ["places", "paths"]
     assert all(each.grad is None or each.grad.device.type == "cuda" for each in reflector.parameters())
     assert score_episodes(reflector.eval(), touching(4, 1)).device.type == "cpu"

@@ -26,7 +26,7 @@ def make(texts=TEXTS):
             PathReflectorConfig.for_cameras({"front": {text: FRONT for text in texts}}, image_size=SIZE),
         ),
         CompactLessons(encoder_steps=2, steps=2, batch_size=4),
-        PathLessons(steps=2, batch_size=4),
+        PathLessons(steps=2, place_steps=2, batch_size=4),
     )
 
 
@@ -48,8 +48,8 @@ def test_each_lesson_teaches_the_judge_that_it_is_for_and_no_other():
             (lesson.name, {n.split(".")[0] for n, value in before.items() if not torch.equal(value, now[n])})
         )
         before = {name: value.clone() for name, value in now.items()}
-    # The statistics of the path are fitted when its lesson begins.
-    assert changed == [("encoder", {"video"}), ("head", {"video"}), ("paths", {"path"})]
+    # The statistics of the path are fitted when its first lesson begins.
+    assert changed == [("encoder", {"video"}), ("head", {"video"}), ("places", {"path"}), ("paths", {"path"})]
 
 
 def test_both_are_saved_and_loaded_together(tmp_path):

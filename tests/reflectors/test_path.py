@@ -92,7 +92,10 @@ def test_scores_are_those_of_each_prefix_alone_in_whatever_pieces_the_path_comes
             crops = reflector.crops(one["front"].unsqueeze(1), reflector.views_of([texts[row]]), poses)
             looks = reflector.look(crops)
             words = reflector.vocabulary.ids([texts[row]])
-            alone = reflector.logits(looks, reflector.path(poses), words)[:, -1].sigmoid().mean()
+            levels = reflector.places.levels([texts[row]])
+            view = reflector.views_of([texts[row]])
+            _, places = reflector.places(one["front"].unsqueeze(1), view, words, levels)
+            alone = reflector.logits(looks, reflector.path(poses, places), words)[:, -1].sigmoid().mean()
             torch.testing.assert_close(streamed[row, last], alone)
 
 
@@ -142,10 +145,11 @@ def touching(count, seed, texts=TEXTS):
 
 
 def test_it_learns_from_the_first_frame_and_the_path_whether_the_goal_is_reached():
-    reflector = make(lessons=PathLessons(steps=250, batch_size=32), members=1, stride=1, window=0.4, crop_size=13)
-    (lesson,) = reflector.train().train_on(touching(256, 0))
-    losses = work_through(reflector)(lesson)
-    assert sum(losses[-20:]) < 0.6 * sum(losses[:20])
+    lessons = PathLessons(steps=250, place_steps=20, batch_size=32)
+    reflector = make(lessons=lessons, members=1, stride=1, window=0.4, crop_size=13)
+    for lesson in reflector.train().train_on(touching(256, 0)):
+        losses = work_through(reflector)(lesson)
+    assert lesson.name == "paths" and sum(losses[-20:]) < 0.6 * sum(losses[:20])
     held_out = touching(128, 1)
     scores = score_episodes(reflector.eval(), held_out)
     right = (scores[:, -1] > 0.5) == held_out["success"][:, -1]
@@ -160,11 +164,38 @@ def test_it_learns_from_the_first_frame_and_the_path_whether_the_goal_is_reached
 
 def test_the_loss_of_a_batch_is_the_mean_of_its_episodes():
     reflector, episodes = make(lessons=PathLessons(steps=1, batch_size=8)), touching(8, 0)
-    (lesson,) = reflector.train_on(episodes)
-    batch = lesson.sample()
-    batch["weight"][3, 2:] = 0  # an episode that ended early
-    each = [reflector.training_loss(batch[row : row + 1])["loss_reflector"] for row in range(8)]
-    torch.testing.assert_close(reflector.training_loss(batch)["loss_reflector"], torch.stack(each).mean())
+    assert 0 < episodes["success"].any(1).sum() < 8
+    names = []
+    for lesson in reflector.train_on(episodes):
+        batch = lesson.sample()
+        if lesson.name == "paths":
+            batch["weight"][3, 2:] = 0  # an episode that ended early
+        each = [reflector.training_loss(batch[row : row + 1])["loss_reflector"] for row in range(8)]
+        torch.testing.assert_close(reflector.training_loss(batch)["loss_reflector"], torch.stack(each).mean())
+        names.append(lesson.name)
+    assert names == ["places", "paths"]
+
+
+def test_a_training_that_is_begun_again_goes_on_from_the_places_that_it_had_found():
+    lessons = PathLessons(steps=1, place_steps=3, batch_size=8)
+    one, other, episodes = make(lessons=lessons), make(lessons=lessons), touching(16, 0)
+    straight, again = one.train_on(episodes), other.train_on(episodes)
+    work_through(one)(next(straight))
+    next(again)  # a new process comes here, and takes the weights that the first had saved
+    other.load_state_dict(one.state_dict())
+    drawn = []
+    for rest in (straight, again):
+        lesson = next(rest)
+        torch.manual_seed(5)
+        drawn.append(lesson.sample())
+    assert (drawn[0] == drawn[1]).all()
+
+
+def test_where_nothing_ever_succeeds_there_are_no_places_to_learn():
+    episodes = touching(8, 0)
+    episodes["success"] = torch.zeros_like(episodes["success"])
+    (lesson,) = make(lessons=PathLessons(steps=1, batch_size=8)).train_on(episodes)
+    assert lesson.name == "paths" and not lesson.sample()["label"].any()
 
 
 def test_later_frames_are_not_looked_at():
@@ -197,7 +228,8 @@ def test_an_env_shows_it_the_same_path_as_a_recording():
 
 
 def test_it_is_saved_with_its_cameras_and_what_it_learned(tmp_path):
-    reflector, episodes = make(("front", "beside"), lessons=PathLessons(steps=1, batch_size=4)), touching(8, 0)
+    lessons = PathLessons(steps=1, place_steps=1, batch_size=4)
+    reflector, episodes = make(("front", "beside"), lessons=lessons), touching(8, 0)
     episodes = Videos(
         {"front": episodes.films["front"], "beside": episodes.films["front"]},
         episodes.instructions,
@@ -205,8 +237,8 @@ def test_it_is_saved_with_its_cameras_and_what_it_learned(tmp_path):
         episodes["task_id"].squeeze(-1).tolist(),
     )
     episodes["kinematic_states"] = paths(8, 12)
-    (lesson,) = reflector.train_on(episodes)
-    work_through(reflector)(lesson)
+    for lesson in reflector.train_on(episodes):
+        work_through(reflector)(lesson)
     reflector.save_pretrained(tmp_path)
     again = PathReflector.from_pretrained(tmp_path).eval()
     assert (
@@ -214,6 +246,7 @@ def test_it_is_saved_with_its_cameras_and_what_it_learned(tmp_path):
         and again.cameras == ("front", "beside")
         and float(reflector.std.max()) != 1.0
     )
+    assert torch.equal(again.places.height, reflector.places.height) and (again.places.height != 0).all()
     assert torch.equal(score_episodes(again, episodes), score_episodes(reflector.eval(), episodes))
 
 

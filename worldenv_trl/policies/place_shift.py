@@ -11,8 +11,9 @@ from torch import Tensor
 
 from worldenv_trl.keys import APPROACH, CHUNK, POSITION_STEP, STATE, WAYPOINT, image_key
 from worldenv_trl.kinematics.calibrations import Calibrations, check_instructions, plain_cameras
+from worldenv_trl.kinematics.planes import plane, warped
 from worldenv_trl.language import instructions_of
-from worldenv_trl.policies.scene_shift import check_moves, draw_moves, plane, warped
+from worldenv_trl.policies.scene_shift import check_moves, draw_moves
 from worldenv_trl.robot import Camera
 
 __all__ = ["PlaceShift"]

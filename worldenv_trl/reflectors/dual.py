@@ -95,4 +95,5 @@ class DualReflector(Reflector, Pretrained):
 
     def training_loss(self, batch: TensorDictBase) -> TensorDict:
         """That of the judge whose lesson drew the batch."""
-        return (self.path if "path" in batch.keys() else self.video).training_loss(batch)  # noqa: SIM118
+        of_path = not {"path", "place"}.isdisjoint(batch.keys())
+        return (self.path if of_path else self.video).training_loss(batch)

@@ -19,6 +19,7 @@ from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.reflectors.base import Lesson, Reflector
 from worldenv_trl.reflectors.goal import MAX_WORDS, Goal
 from worldenv_trl.reflectors.path_lessons import PathLessons, lessons_of
+from worldenv_trl.reflectors.places import KINDS, Places, offset_size, offsets
 from worldenv_trl.robot.camera import Camera
 
 if TYPE_CHECKING:
@@ -97,13 +98,14 @@ class PathReflectorConfig:
 class PathReflector(Reflector, Pretrained):
     """R(o_1, s_1:t, g): the probability that the goal is reached by t, of the first frame and the commanded path alone.
 
-    Every ``stride`` frames it looks at the first frame around the point where the hand is then: what will be under the
-    fingers was seen sharply once, before the hand covered it. Causal convolutions over these looks and the hand's
-    poses, and mean and maximum of what they say so far, give R of every prefix. It learns from real rollouts which path
-    fails in which scene, and reads nothing that a world model paints, so ghosts of success cannot mislead it; what
-    happens otherwise than commanded it does not see either. A hand view is what others predict as a
-    second camera (Ctrl-World, 2510.10125); success told for every frame is the reward head of World-VLA-Loop
-    (2602.06508).
+    On the first frame it finds where hands that succeed come down, and where they are when the goal is reached, and
+    how this hand lies relative to both (:mod:`~worldenv_trl.reflectors.places`). Every ``stride`` frames it also looks
+    at the first frame around the point where the hand is then: what will be under the fingers was seen sharply once,
+    before the hand covered it. Causal convolutions over all of this and the hand's poses, and mean and maximum of what
+    they say so far, give R of every prefix. It learns from real rollouts which path fails in which scene, and reads
+    nothing that a world model paints, so ghosts of success cannot mislead it; what happens otherwise than commanded it
+    does not see either. A hand view is what others predict as a second camera (Ctrl-World, 2510.10125); success told
+    for every frame is the reward head of World-VLA-Loop (2602.06508).
 
     Args:
         config: cameras and sizes.
@@ -140,7 +142,9 @@ class PathReflector(Reflector, Pretrained):
         self.vocabulary = Vocabulary(Vocabulary.of(config.instructions), MAX_WORDS)
         self._views = [Calibrations(by_text) for by_text in config.cameras.values()]
         self._maps = nn.ModuleList(ActionMap(view.distinct, config.image_size) for view in self._views)
-        self.members = nn.ModuleList(_Member(config, len(self.vocabulary.words)) for _ in range(config.members))
+        num_words = len(self.vocabulary.words)
+        self.places = Places(self._views, config.image_size, config.instructions, num_words)
+        self.members = nn.ModuleList(_Member(config, num_words) for _ in range(config.members))
         self.register_buffer("mean", torch.zeros(2 * POSE_DIM))
         self.register_buffer("std", torch.ones(2 * POSE_DIM))
 
@@ -154,6 +158,8 @@ class PathReflector(Reflector, Pretrained):
         state["first"] = torch.stack([self._checked(frames, camera) for camera in self.cameras], 1)
         state["view"] = self.views_of(instructions).to(poses.device)
         state["words"] = self.vocabulary.ids(instructions, poses.device)
+        levels = self.places.levels(instructions)
+        state["places"] = self.places(state["first"], state["view"], state["words"], levels)[1]
         state["poses"], state["seen"] = poses, torch.ones(len(poses), dtype=torch.int64, device=poses.device)
         crops = self.crops(state["first"], state["view"], poses)
         state["looks"] = self.look(crops)
@@ -192,14 +198,18 @@ class PathReflector(Reflector, Pretrained):
     def _scores(self, state: TensorDictBase, place: Tensor) -> Tensor:
         """R after the frames ``place`` [n, C]: that of the last look up to each."""
         stride = self.config.stride
-        path = self.path(state["poses"][:, ::stride])
+        path = self.path(state["poses"][:, ::stride], state["places"])
         logits = self.logits(state["looks"][:, ::stride], path, state["words"])
         return logits.sigmoid().mean(-1).gather(1, place // stride)
 
-    def path(self, poses: Tensor) -> Tensor:
-        """What the networks are told of poses [n, L, 13], one at each look: the pose and how it changed, [n, L, 26]."""
+    def moves(self, poses: Tensor) -> Tensor:
+        """Poses [n, L, 13], one at each look, and how they changed, normalised: [n, L, 26]."""
         change = torch.cat([torch.zeros_like(poses[:, :1]), poses.diff(dim=1)], 1)
         return (torch.cat([poses, change], -1) - self.mean) / self.std
+
+    def path(self, poses: Tensor, places: Tensor) -> Tensor:
+        """What the networks are told of poses [n, L, 13] and places [n, Q, 2]: moves and offsets, [n, L, 26 + F]."""
+        return torch.cat([self.moves(poses), offsets(poses[..., :3], places)], -1)
 
     def views_of(self, instructions: Sequence[str]) -> Tensor:
         """Which calibration of each camera the n instructions' scenes are seen through, int64 [n, V], on the CPU."""
@@ -238,7 +248,7 @@ class PathReflector(Reflector, Pretrained):
 
         Args:
             looks: [P, L, M, F], what the members saw at each look.
-            path: [P, L, 26].
+            path: [P, L, 26 + F], see :meth:`path`.
             words: int64 [P, W].
         """
         each = [member(looks[:, :, index], path, words) for index, member in enumerate(self.members)]
@@ -247,7 +257,8 @@ class PathReflector(Reflector, Pretrained):
     # ------------------------------------------------------------------------------------------------- learning
 
     def train_on(self, episodes: Episodes) -> Iterator[Lesson]:
-        """One lesson, ``paths``: whole episodes, every task equally often, labelled at every look.
+        """Two lessons: ``places``, from the first frames of episodes that succeed, none if no episode does; then
+        ``paths``, from whole episodes, every task equally often, labelled at every look.
 
         Outcomes are drawn as often as they occur, so that R is a probability.
 
@@ -258,12 +269,17 @@ class PathReflector(Reflector, Pretrained):
         return lessons_of(self, episodes)
 
     def training_loss(self, batch: TensorDictBase) -> TensorDict:
-        """Binary cross-entropy of "reached by then", mean over episodes of the mean over looks plus that of the last.
+        """Of paths the binary cross-entropy of "reached by then", mean over episodes of the mean over looks plus that
+        of the last; of places the divergence of the maps from what they are taught.
 
         Args:
-            batch: [P] with ``crops`` floats [P, L, 3 V, S, S], ``path`` [P, L, 26], ``words`` int64 [P, W], ``label``
-                bool [P, L], and ``weight`` [P, L]: 1 up to the episode's end, 0 behind it.
+            batch: [P] of one lesson. Of ``paths``: ``crops`` floats [P, L, 3 V, S, S], ``path`` [P, L, 26 + F],
+                ``words`` int64 [P, W], ``label`` bool [P, L], and ``weight`` [P, L]: 1 up to the episode's end, 0
+                behind it. Of ``places``: ``first`` uint8 [P, V, 3, H, W], ``view`` int64 [P, V], ``words``, ``levels``
+                [P, K] (m) and ``place`` [P, K, 3] (m).
         """
+        if "place" in batch.keys():  # noqa: SIM118
+            return self._places_loss(batch)
         label, weight = batch["label"].float(), batch["weight"]
         looks = self.look(batch["crops"])
         logits = self.logits(looks, batch["path"], batch["words"])
@@ -274,6 +290,14 @@ class PathReflector(Reflector, Pretrained):
         loss = (dense + each[rows, last]).mean(0).sum()  # members learn on their own
         right = (logits.detach()[rows, last].sigmoid().mean(-1) > 0.5) == (label[rows, last] > 0.5)
         return TensorDict({"loss_reflector": loss, "accuracy": right.float().mean()})
+
+    def _places_loss(self, batch: TensorDictBase) -> TensorDict:
+        place, view = batch["place"], batch["view"]
+        maps, points = self.places(batch["first"], view, batch["words"], batch["levels"])
+        taught = self.places.targets(place, view)
+        loss = (torch.xlogy(taught, taught) - taught * maps).sum(-1).mean(0).sum()
+        away = (points.detach().unflatten(1, (-1, KINDS)) - place[:, None, :, :2]).norm(dim=-1)
+        return TensorDict({"loss_reflector": loss, "accuracy": (away < 0.02).float().mean()})
 
 
 class _Member(nn.Module):
@@ -289,7 +313,8 @@ class _Member(nn.Module):
             nn.Flatten(), nn.Dropout(config.dropout), nn.Linear(32 * cells**2, config.feature_dim),
         )  # fmt: skip
         self.goal = Goal(num_words, 16, width, scale=1.0)
-        self.into = nn.Linear(config.feature_dim + 2 * POSE_DIM, width)
+        told = 2 * POSE_DIM + offset_size(KINDS * len(config.cameras))
+        self.into = nn.Linear(config.feature_dim + told, width)
         self.over_time = nn.ModuleList(_Causal(width, dilation, config.dropout) for dilation in _DILATIONS)
         self.head = nn.Sequential(nn.Dropout(config.dropout), nn.Linear(3 * width, 1))
 

@@ -14,6 +14,7 @@ from worldenv_trl.devices import device_of
 from worldenv_trl.keys import TASK_ID
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.reflectors.base import Lesson
+from worldenv_trl.reflectors.places import offsets, places_of
 
 if TYPE_CHECKING:
     from worldenv_trl.data import Episodes
@@ -31,7 +32,8 @@ class PathLessons:
     """How long a :class:`PathReflector` learns.
 
     Args:
-        steps: batches.
+        steps: batches of paths.
+        place_steps: batches of places, before.
         batch_size: episodes in a batch.
         lr: the highest learning rate.
         weight_decay: of AdamW.
@@ -41,13 +43,17 @@ class PathLessons:
     """
 
     steps: int = 800
+    place_steps: int = 400
     batch_size: int = 48
     lr: float = 1e-3
     weight_decay: float = 0.05
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.batch_size) < 1:
-            raise ValueError(f"steps and batch_size must be at least 1, got {self.steps} and {self.batch_size}")
+        if min(self.steps, self.place_steps, self.batch_size) < 1:
+            raise ValueError(
+                "steps, place_steps and batch_size must be at least 1, "
+                f"got {self.steps}, {self.place_steps} and {self.batch_size}"
+            )
         if not self.lr > 0 or self.weight_decay < 0:
             raise ValueError(f"lr must be above 0 and weight_decay not below, got {self.lr} and {self.weight_decay}")
 
@@ -71,20 +77,45 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
     poses = ForwardKinematics.commanded_pose(episodes["kinematic_states"])[:, ::stride].to(device)
     weight = episodes.alive[:, ::stride].float().to(device)
     label = (episodes["success"].long().cummax(1).values[:, ::stride] > 0).to(device)
-    words = reflector.vocabulary.ids(episodes.instructions, device)
+    texts, view = episodes.instructions, reflector.views_of(episodes.instructions).to(device)
+    words = reflector.vocabulary.ids(texts, device)
+    number = episodes[TASK_ID].squeeze(-1)
     _fit_statistics(reflector, poses, weight)
-    path, seen = reflector.path(poses), _all_crops(reflector, episodes, poses)
-    pools = [(episodes[TASK_ID].squeeze(-1) == task).nonzero().squeeze(-1) for task in episodes[TASK_ID].unique()]
 
-    def sample() -> TensorDict:
-        share = max(1, plan.batch_size // len(pools))
-        rows = torch.cat([pool[torch.randint(len(pool), (share,))] for pool in pools]).to(device)
+    place, reached = places_of(poses[..., :3], label), label[:, -1].cpu()
+    if reached.any():
+        reflector.places.fit(place, reached.to(device), texts, poses[..., :3])
+        levels, succeeded = reflector.places.levels(texts), _by_task(number, reached)
+
+        def sample_places() -> TensorDict:
+            rows = _drawn(succeeded, plan.batch_size)
+            here = rows.to(device)
+            return TensorDict(
+                {
+                    "first": _first_frames(reflector, episodes, rows),
+                    "view": view[here],
+                    "words": words[here],
+                    "levels": levels[here],
+                    "place": place[here],
+                },
+                batch_size=[len(rows)],
+            )
+
+        finds = list(reflector.places.parameters())
+        yield Lesson("places", finds, sample_places, plan.place_steps, plan.lr, plan.weight_decay)
+
+    seen, points = _all_seen(reflector, episodes, poses)
+    moves, apart = reflector.moves(poses), offsets(poses[..., :3], points)
+    tasks = _by_task(number, torch.ones_like(reached))
+
+    def sample_paths() -> TensorDict:
+        rows = _drawn(tasks, plan.batch_size).to(device)
         light = 1 + _LIGHT * torch.randn(len(rows), 1, 1, 1, 1, device=device)
-        told = path[rows]
+        told = moves[rows]
         return TensorDict(
             {
                 "crops": light * (seen[rows].float() / 255 - 0.5),
-                "path": told + _PATH_NOISE * torch.randn_like(told),
+                "path": torch.cat([told + _PATH_NOISE * torch.randn_like(told), apart[rows]], -1),
                 "words": words[rows],
                 "label": label[rows],
                 "weight": weight[rows],
@@ -92,26 +123,47 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
             batch_size=[len(rows)],
         )
 
-    yield Lesson("paths", list(reflector.members.parameters()), sample, plan.steps, plan.lr, plan.weight_decay)
+    judges = list(reflector.members.parameters())
+    yield Lesson("paths", judges, sample_paths, plan.steps, plan.lr, plan.weight_decay)
+
+
+def _by_task(number: Tensor, chosen: Tensor) -> list[Tensor]:
+    """The chosen rows of each task that has some."""
+    each = [((number == task) & chosen).nonzero().squeeze(-1) for task in number.unique()]
+    return [rows for rows in each if len(rows)]
+
+
+def _drawn(pools: list[Tensor], count: int) -> Tensor:
+    """About ``count`` rows, as many of each pool, at least one."""
+    share = max(1, count // len(pools))
+    return torch.cat([pool[torch.randint(len(pool), (share,))] for pool in pools])
 
 
 def _fit_statistics(reflector: PathReflector, poses: Tensor, weight: Tensor) -> None:
     """Mean and spread of what the networks are told; what never changes, such as a fixed rotation, stays as it is."""
     reflector.mean.zero_()
     reflector.std.fill_(1.0)
-    told = reflector.path(poses)[weight > 0]
+    told = reflector.moves(poses)[weight > 0]
     reflector.mean.copy_(told.mean(0))
     reflector.std.copy_(told.std(0).clamp(min=1e-3))
 
 
+def _first_frames(reflector: PathReflector, episodes: Episodes, rows: Tensor) -> Tensor:
+    """uint8 [n, V, 3, H, W] of the episodes ``rows`` [n]."""
+    start = torch.zeros_like(rows)
+    shown = [episodes.frames(camera, rows, start) for camera in reflector.cameras]
+    return torch.stack(shown, 1).to(device_of(reflector))
+
+
 @torch.no_grad()
-def _all_crops(reflector: PathReflector, episodes: Episodes, poses: Tensor) -> Tensor:
-    """The crops of all episodes at all looks, as bytes."""
-    parts = []
+def _all_seen(reflector: PathReflector, episodes: Episodes, poses: Tensor) -> tuple[Tensor, Tensor]:
+    """Of all episodes the crops at all looks, as bytes, and the places."""
+    crops, points = [], []
     for rows in torch.arange(len(episodes)).split(_EPISODES_AT_ONCE):
-        start, texts = torch.zeros_like(rows), [episodes.instructions[row] for row in rows.tolist()]
-        shown = [episodes.frames(camera, rows, start) for camera in reflector.cameras]
-        first = torch.stack(shown, 1).to(poses.device)
-        seen = reflector.crops(first, reflector.views_of(texts).to(poses.device), poses[rows.to(poses.device)])
-        parts.append(((seen + 0.5) * 255).round().to(torch.uint8))
-    return torch.cat(parts)
+        texts = [episodes.instructions[row] for row in rows.tolist()]
+        first, view = _first_frames(reflector, episodes, rows), reflector.views_of(texts).to(poses.device)
+        seen = reflector.crops(first, view, poses[rows.to(poses.device)])
+        crops.append(((seen + 0.5) * 255).round().to(torch.uint8))
+        words, levels = reflector.vocabulary.ids(texts, poses.device), reflector.places.levels(texts)
+        points.append(reflector.places(first, view, words, levels)[1])
+    return torch.cat(crops), torch.cat(points)

@@ -1,0 +1,172 @@
+"""Where on the first frame the hand comes down and where the goal is reached, and how a hand lies relative to that."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from worldenv_trl.kinematics import ActionMap
+from worldenv_trl.kinematics.calibrations import Calibrations
+from worldenv_trl.kinematics.planes import plane
+from worldenv_trl.reflectors.goal import Goal
+
+__all__ = ["KINDS", "Places", "offset_size", "offsets", "places_of"]
+
+KINDS = 2  # where the hand comes down, where it is when the goal is reached
+_WAVELENGTHS = (0.24, 0.12, 0.06)  # m
+_NEAR, _FAR = 0.05, 4.0  # m that count as one, and how many at most
+_FALLEN, _STOPPED = 0.03, 0.01  # m below where it began; fall from a look to the next
+_WIDTH = 0.7  # standard deviation of what a map is taught, in cells
+
+
+class Places(nn.Module):
+    """Maps of the first frame, one for each place, and the points of the table that they mean.
+
+    A map is what a policy's aim is (:class:`~worldenv_trl.objectives.AimedCloning`; Transporter networks,
+    arXiv:2010.14406), taught by rollouts that succeed: noise of the hand averages out, so a map finds a bowl to a
+    millimetre from places that lie a centimetre beside it.
+
+    Args:
+        views: of each of the V cameras.
+        image_size: height and width of the frames (px).
+        instructions: those that heights are kept for.
+        num_words: of the vocabulary.
+        width: channels.
+    """
+
+    height: Tensor
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self,
+        views: Sequence[Calibrations],
+        image_size: int,
+        instructions: Sequence[str],
+        num_words: int,
+        width: int = 32,
+    ) -> None:
+        super().__init__()
+        self._views, self.image_size, self.side = list(views), image_size, -(-image_size // 2)
+        self._number = {text: number for number, text in enumerate(instructions)}
+        self._drawn = nn.ModuleList(ActionMap(view.distinct, image_size) for view in views)
+        self.eyes = nn.ModuleList(_Eye(num_words, width) for _ in views)
+        self.register_buffer("height", torch.zeros(len(instructions), KINDS))  # m
+        self.register_buffer("low", torch.full((2,), -1.0))  # m: where a hand has been
+        self.register_buffer("high", torch.ones(2))
+
+    def forward(self, first: Tensor, view: Tensor, words: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
+        """Log-probabilities of the maps' cells, and the points that they mean.
+
+        Args:
+            first: uint8 [n, V, 3, H, W], the first frames.
+            view: int64 [n, V], which calibration of each camera.
+            words: int64 [n, W].
+            levels: [n, K] (m), see :meth:`levels`.
+
+        Returns:
+            [n, V, K, P] and [n, V * K, 2] (m): where the rays of the cells meet the places' level.
+        """
+        maps = torch.stack([eye(first[:, index], words) for index, eye in enumerate(self.eyes)], 1)
+        chances = maps.exp()
+        points = []
+        for index, known in enumerate(self._views):
+            met = chances.new_zeros(len(first), KINDS, self.side**2, 2)
+            for number, camera in enumerate(known.distinct):
+                rows = (view[:, index] == number).nonzero().squeeze(-1)
+                table = plane(camera, (self.side, self.side), levels[rows].flatten())[..., :2]
+                met[rows] = table.reshape(len(rows), KINDS, -1, 2)
+            met = torch.minimum(torch.maximum(met, self.low), self.high)
+            points.append(torch.einsum("nkp,nkpc->nkc", chances[:, index], met))
+        return maps, torch.cat(points, 1)
+
+    def levels(self, texts: Sequence[str]) -> Tensor:
+        """How high hands are at the places of n instructions, [n, K] (m); the mean of all where that is not known."""
+        table = torch.cat([self.height, self.height.mean(0, keepdim=True)])
+        return table[[self._number.get(text, len(self.height)) for text in texts]]
+
+    def fit(self, points: Tensor, reached: Tensor, texts: Sequence[str], hands: Tensor) -> None:
+        """Takes heights from the places [R, K, 3] of the episodes that ``reached`` [R], and bounds from all hands."""
+        flat = hands[..., :2].flatten(0, -2)
+        self.low.copy_(flat.amin(0))
+        self.high.copy_(flat.amax(0))
+        rows_of: dict[str, list[int]] = {text: [] for text in self._number}
+        for row in reached.nonzero().squeeze(-1).tolist():
+            rows_of[texts[row]].append(row)
+        everywhere = points[reached][..., 2].median(0).values
+        for text, rows in rows_of.items():
+            self.height[self._number[text]] = points[rows][..., 2].median(0).values if rows else everywhere
+
+    def targets(self, points: Tensor, view: Tensor) -> Tensor:
+        """What the maps are taught of places [n, K, 3]: normal densities around where they are seen, [n, V, K, P]."""
+        cells = torch.arange(self.side, device=points.device) + 0.5
+        taught = []
+        for index, drawn in enumerate(self._drawn):
+            shown = cast(ActionMap, drawn).project(points, view[:, index : index + 1].expand(points.shape[:2]))
+            seen = shown * self.side / self.image_size
+            right, down = ((cells - each[..., None]).square() for each in seen.unbind(-1))  # [n, K, side]
+            away = down[..., :, None] + right[..., None, :]
+            taught.append((-away / (2 * _WIDTH**2)).flatten(2).softmax(-1))
+        return torch.stack(taught, 1)
+
+
+def places_of(hands: Tensor, reached: Tensor) -> Tensor:
+    """Where each hand comes down and where it is when the goal is reached, [R, K, 3].
+
+    It has come down where it first stops to fall, 3 cm or more below where it began.
+
+    Args:
+        hands: [R, L, 3] (m), at each look.
+        reached: bool [R, L], whether the goal is reached by then.
+    """
+    height, rows = hands[..., 2], torch.arange(len(hands), device=hands.device)
+    end = torch.where(reached.any(1), reached.long().argmax(1), reached.shape[1] - 1)
+    fall = height - torch.cat([height[:, 1:], height[:, -1:]], 1)
+    until = torch.arange(reached.shape[1], device=hands.device) <= end.unsqueeze(-1)
+    down = (height[:, :1] - height > _FALLEN) & (fall < _STOPPED) & until
+    landed = torch.where(down.any(1), down.long().argmax(1), end)
+    return torch.stack([hands[rows, landed], hands[rows, end]], 1)
+
+
+def offset_size(points: int) -> int:
+    """Length of :func:`offsets` from that many points."""
+    return 2 * points + 2 * len(_WAVELENGTHS) * (2 * points + 1)
+
+
+def offsets(hands: Tensor, points: Tensor) -> Tensor:
+    """How hands [n, L, 3] lie relative to points [n, Q, 2] of the table, [n, L, F].
+
+    Two millimetres decide whether a hand takes hold, and are a fiftieth of how far hands go: told as numbers of that
+    size they hardly reach what a network says. On sines and cosines they do. (Fourier features, arXiv:2006.10739.)
+    """
+    apart = (hands[:, :, None, :2] - points[:, None]).flatten(2)  # [n, L, 2 Q]
+    told, where = [(apart / _NEAR).clamp(-_FAR, _FAR)], torch.cat([apart, hands[..., 2:]], -1)
+    for wavelength in _WAVELENGTHS:
+        phase = 2 * math.pi / wavelength * where
+        told += [phase.sin(), phase.cos()]
+    return torch.cat(told, -1)
+
+
+class _Eye(nn.Module):
+    """One camera's frames to log-probabilities [n, K, P] of half as many cells a side."""
+
+    def __init__(self, num_words: int, width: int) -> None:
+        super().__init__()
+        self.stem = nn.Sequential(
+            nn.Conv2d(3, width, 5, stride=2, padding=2), nn.GELU(),
+            nn.Conv2d(width, width, 3, padding=1), nn.GELU(),
+        )  # fmt: skip
+        self.goal = Goal(num_words, 16, width, scale=1.0)
+        self.maps = nn.Sequential(
+            nn.Conv2d(width, width, 3, padding=1), nn.GELU(),
+            nn.Conv2d(width, width, 3, padding=1), nn.GELU(),
+            nn.Conv2d(width, KINDS, 1),
+        )  # fmt: skip
+
+    def forward(self, frames: Tensor, words: Tensor) -> Tensor:
+        seen = self.stem(frames.float() / 255 - 0.5) + self.goal(words)[..., None, None]
+        return self.maps(seen).flatten(2).log_softmax(-1)
