@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from worldenv_trl.kinematics.calibrations import Calibrations, plain_cameras
-from worldenv_trl.reflectors.places import KINDS, Places, offset_size, offsets, places_of
+from worldenv_trl.reflectors.places import KINDS, Places, offsets, places_of
 from worldenv_trl.robot.camera import look_at
 
 SIZE = 32
@@ -66,15 +66,19 @@ def test_a_cell_means_the_point_at_its_level_that_the_camera_sees_there():
                 np.testing.assert_allclose(seen, (right + 0.5, down + 0.5), atol=1e-3)
 
 
-def test_what_a_map_is_taught_peaks_where_the_place_is_seen():
-    places, generator = make(), torch.Generator().manual_seed(0)
-    place = torch.rand(6, KINDS, 3, generator=generator) * torch.tensor([0.2, 0.2, 0.1]) - torch.tensor([0.1, 0.1, 0])
-    taught = places.targets(place, torch.zeros(6, 1, dtype=torch.int64))
-    assert taught.shape == (6, 1, KINDS, 256)
-    torch.testing.assert_close(taught.sum(-1), torch.ones(6, 1, KINDS))
-    grid = torch.stack(torch.meshgrid(torch.arange(16), torch.arange(16), indexing="xy"), -1).flatten(0, 1) + 0.5
-    centre = torch.einsum("nvkp,pc->nvkc", taught, grid)[:, 0]
-    np.testing.assert_allclose(centre, FRONT.project(place.numpy(), 16), atol=0.02)
+def test_a_map_diverges_least_where_the_place_is_seen():
+    places = make()
+    seen = torch.tensor([[[[9.0, 21.0], [16.0, 16.0]]]])  # px: cells (4.5, 10.5), a centre, and (8, 8), a corner
+    cells = torch.arange(16) + 0.5
+    away = (cells - 4.5).square() + (cells - 10.5).square().unsqueeze(-1)  # another way to the same density
+    right = (-away / (2 * 0.7**2)).flatten().log_softmax(0)
+    maps = right.expand(1, 1, KINDS, 256)
+    far = places.divergence(maps, seen)
+    assert far.shape == (1, 1, KINDS)
+    assert abs(far[0, 0, 0]) < 1e-5 and far[0, 0, 1] > 5
+    spread = places.divergence(torch.full((1, 1, KINDS, 256), 1 / 256).log(), seen)
+    expected = np.log(256) - torch.distributions.Categorical(logits=right).entropy()
+    np.testing.assert_allclose(spread[0, 0, 0], expected, rtol=1e-5)
 
 
 def test_levels_are_the_middle_of_where_episodes_succeed():
@@ -94,7 +98,7 @@ def test_offsets_are_distances_and_their_waves():
     generator = torch.Generator().manual_seed(2)
     hand, point = 0.2 * torch.rand(3, 5, 3, generator=generator), 0.2 * torch.rand(3, 4, 2, generator=generator)
     told = offsets(hand, point)
-    assert told.shape == (3, 5, offset_size(4))
+    assert told.shape == (3, 5, 8 + 2 * 3 * 9)
     apart = (hand[:, :, None, :2] - point[:, None]).numpy()
     np.testing.assert_allclose(told[..., :8], np.clip(apart / 0.05, -4, 4).reshape(3, 5, 8), atol=1e-6)
     shortest = told[..., -18:-9]  # sines of what is shortest: 8 distances and the height, told as often as 6 cm
@@ -123,7 +127,8 @@ def test_it_finds_a_block_from_places_that_lie_beside_it():
         rows = torch.randint(512, (64,), generator=generator)
         place = block[rows, None] + 0.01 * torch.randn(64, KINDS, 3, generator=generator)
         maps, _ = places(frames[rows], view, words, levels)
-        loss = -(places.targets(place, view) * maps).sum(-1).mean()
+        seen = torch.from_numpy(FRONT.project(place.numpy(), SIZE)).float().unsqueeze(1)
+        loss = places.divergence(maps, seen).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from worldenv_trl.keys import ACTION_IS_PAD, WAYPOINT
 from worldenv_trl.kinematics import ActionMap
 from worldenv_trl.kinematics.calibrations import Calibrations, check_instructions, plain_cameras
+from worldenv_trl.kinematics.cells import log_density
 from worldenv_trl.language import instructions_of
 from worldenv_trl.policies.base import Aims
 from worldenv_trl.robot import Camera
@@ -103,9 +104,7 @@ class AimedCloning(nn.Module):
         """[n] nats of one camera's log-probabilities [n, h, w] against points [n, 3]; 0 where there is no place."""
         (views, maps), side, device = self._views[name], log_probs.shape[-1], where.device
         seen = maps.to(device).project(where, views.indices(texts)) * (side / _SIDE)  # [n, 2], in cells
-        cells = torch.arange(side, device=device) + 0.5
-        right, down = ((cells - each[:, None]).square() for each in seen.unbind(-1))  # [n, side] each
-        target = (-(down[:, :, None] + right[:, None]) / (2 * self.width**2)).flatten(1).log_softmax(-1)
+        target = log_density(seen, side, self.width)
         far = (target.exp() * (target - log_probs.flatten(1))).sum(-1)
         inside = ((seen > 0) & (seen < side)).all(-1)
         return torch.where(inside, far, torch.zeros_like(far))

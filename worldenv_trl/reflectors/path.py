@@ -19,7 +19,7 @@ from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.reflectors.base import Lesson, Reflector
 from worldenv_trl.reflectors.goal import MAX_WORDS, Goal
 from worldenv_trl.reflectors.path_lessons import PathLessons, lessons_of
-from worldenv_trl.reflectors.places import KINDS, Places, offset_size, offsets
+from worldenv_trl.reflectors.places import KINDS, Places, offsets
 from worldenv_trl.robot.camera import Camera
 
 if TYPE_CHECKING:
@@ -215,6 +215,12 @@ class PathReflector(Reflector, Pretrained):
         """Which calibration of each camera the n instructions' scenes are seen through, int64 [n, V], on the CPU."""
         return torch.stack([view.indices(instructions) for view in self._views], 1)
 
+    def pixels(self, points: Tensor, view: Tensor) -> Tensor:
+        """Where points [n, L, 3] (m) are seen, [n, V, L, 2] (px), through the calibrations ``view`` int64 [n, V]."""
+        each = view.unsqueeze(-1).expand(*view.shape, points.shape[1]).unbind(1)
+        seen = [cast(ActionMap, drawn).project(points, index) for drawn, index in zip(self._maps, each, strict=True)]
+        return torch.stack(seen, 1)
+
     def crops(self, first: Tensor, view: Tensor, poses: Tensor) -> Tensor:
         """The first frames around where the hand is, resampled.
 
@@ -226,14 +232,12 @@ class PathReflector(Reflector, Pretrained):
         Returns:
             Floats [n, L, 3 * V, S, S] in [-.5, .5]; past the frame's edge its last pixels are repeated.
         """
-        count, looks = poses.shape[:2]
-        size, side = self.config.crop_size, self.config.image_size
+        looks, size, side = poses.shape[1], self.config.crop_size, self.config.image_size
         steps = torch.linspace(-1, 1, size, device=poses.device) * self.config.window
-        offsets = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)  # [S, S, (x, y)]
+        around = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)  # [S, S, (x, y)]
         seen = []
-        for index, drawn in enumerate(self._maps):
-            pixels = cast(ActionMap, drawn).project(poses[..., :3], view[:, index : index + 1].expand(count, looks))
-            grid = (2 * pixels / side - 1)[:, :, None, None] + offsets  # [n, L, S, S, 2]
+        for index, pixels in enumerate(self.pixels(poses[..., :3], view).unbind(1)):
+            grid = (2 * pixels / side - 1)[:, :, None, None] + around  # [n, L, S, S, 2]
             image = first[:, index].float() / 255 - 0.5
             crop = F.grid_sample(image, grid.flatten(1, 2), align_corners=False, padding_mode="border")
             seen.append(crop.unflatten(2, (looks, size)).transpose(1, 2))
@@ -294,8 +298,7 @@ class PathReflector(Reflector, Pretrained):
     def _places_loss(self, batch: TensorDictBase) -> TensorDict:
         place, view = batch["place"], batch["view"]
         maps, points = self.places(batch["first"], view, batch["words"], batch["levels"])
-        taught = self.places.targets(place, view)
-        loss = (torch.xlogy(taught, taught) - taught * maps).sum(-1).mean(0).sum()
+        loss = self.places.divergence(maps, self.pixels(place, view)).mean(0).sum()
         away = (points.detach().unflatten(1, (-1, KINDS)) - place[:, None, :, :2]).norm(dim=-1)
         return TensorDict({"loss_reflector": loss, "accuracy": (away < 0.02).float().mean()})
 
@@ -313,8 +316,8 @@ class _Member(nn.Module):
             nn.Flatten(), nn.Dropout(config.dropout), nn.Linear(32 * cells**2, config.feature_dim),
         )  # fmt: skip
         self.goal = Goal(num_words, 16, width, scale=1.0)
-        told = 2 * POSE_DIM + offset_size(KINDS * len(config.cameras))
-        self.into = nn.Linear(config.feature_dim + told, width)
+        apart = offsets(torch.zeros(1, 1, 3), torch.zeros(1, KINDS * len(config.cameras), 2)).shape[-1]
+        self.into = nn.Linear(config.feature_dim + 2 * POSE_DIM + apart, width)
         self.over_time = nn.ModuleList(_Causal(width, dilation, config.dropout) for dilation in _DILATIONS)
         self.head = nn.Sequential(nn.Dropout(config.dropout), nn.Linear(3 * width, 1))
 

@@ -77,36 +77,45 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
     poses = ForwardKinematics.commanded_pose(episodes["kinematic_states"])[:, ::stride].to(device)
     weight = episodes.alive[:, ::stride].float().to(device)
     label = (episodes["success"].long().cummax(1).values[:, ::stride] > 0).to(device)
-    texts, view = episodes.instructions, reflector.views_of(episodes.instructions).to(device)
-    words = reflector.vocabulary.ids(texts, device)
-    number = episodes[TASK_ID].squeeze(-1)
+    texts = episodes.instructions
+    view, words = reflector.views_of(texts).to(device), reflector.vocabulary.ids(texts, device)
+    first, number = _first_frames(reflector, episodes), episodes[TASK_ID].squeeze(-1)
     _fit_statistics(reflector, poses, weight)
 
-    place, reached = places_of(poses[..., :3], label), label[:, -1].cpu()
+    place, reached = places_of(poses[..., :3], label), label[:, -1]
     if reached.any():
-        reflector.places.fit(place, reached.to(device), texts, poses[..., :3])
-        levels, succeeded = reflector.places.levels(texts), _by_task(number, reached)
+        reflector.places.fit(place, reached, texts, poses[..., :3])
+    levels = reflector.places.levels(texts)
+    succeeded, tasks = (
+        _by_task(number, chosen) for chosen in (reached.cpu(), torch.ones_like(number, dtype=torch.bool))
+    )
 
-        def sample_places() -> TensorDict:
-            rows = _drawn(succeeded, plan.batch_size)
-            here = rows.to(device)
-            return TensorDict(
-                {
-                    "first": _first_frames(reflector, episodes, rows),
-                    "view": view[here],
-                    "words": words[here],
-                    "levels": levels[here],
-                    "place": place[here],
-                },
-                batch_size=[len(rows)],
-            )
+    def sample_places() -> TensorDict:
+        rows = _drawn(succeeded, plan.batch_size)
+        here = rows.to(device)
+        return TensorDict(
+            {
+                "first": first[rows].to(device),
+                "view": view[here],
+                "words": words[here],
+                "levels": levels[here],
+                "place": place[here],
+            },
+            batch_size=[len(rows)],
+        )
 
+    if succeeded:
         finds = list(reflector.places.parameters())
         yield Lesson("places", finds, sample_places, plan.place_steps, plan.lr, plan.weight_decay)
 
-    seen, points = _all_seen(reflector, episodes, poses)
-    moves, apart = reflector.moves(poses), offsets(poses[..., :3], points)
-    tasks = _by_task(number, torch.ones_like(reached))
+    crops, points = [], []
+    with torch.no_grad():
+        for rows in torch.arange(len(episodes)).split(_EPISODES_AT_ONCE):
+            here, frames = rows.to(device), first[rows].to(device)
+            seen = reflector.crops(frames, view[here], poses[here])
+            crops.append(((seen + 0.5) * 255).round().to(torch.uint8))
+            points.append(reflector.places(frames, view[here], words[here], levels[here])[1])
+    looks, moves, apart = torch.cat(crops), reflector.moves(poses), offsets(poses[..., :3], torch.cat(points))
 
     def sample_paths() -> TensorDict:
         rows = _drawn(tasks, plan.batch_size).to(device)
@@ -114,7 +123,7 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
         told = moves[rows]
         return TensorDict(
             {
-                "crops": light * (seen[rows].float() / 255 - 0.5),
+                "crops": light * (looks[rows].float() / 255 - 0.5),
                 "path": torch.cat([told + _PATH_NOISE * torch.randn_like(told), apart[rows]], -1),
                 "words": words[rows],
                 "label": label[rows],
@@ -148,22 +157,10 @@ def _fit_statistics(reflector: PathReflector, poses: Tensor, weight: Tensor) -> 
     reflector.std.copy_(told.std(0).clamp(min=1e-3))
 
 
-def _first_frames(reflector: PathReflector, episodes: Episodes, rows: Tensor) -> Tensor:
-    """uint8 [n, V, 3, H, W] of the episodes ``rows`` [n]."""
-    start = torch.zeros_like(rows)
-    shown = [episodes.frames(camera, rows, start) for camera in reflector.cameras]
-    return torch.stack(shown, 1).to(device_of(reflector))
-
-
-@torch.no_grad()
-def _all_seen(reflector: PathReflector, episodes: Episodes, poses: Tensor) -> tuple[Tensor, Tensor]:
-    """Of all episodes the crops at all looks, as bytes, and the places."""
-    crops, points = [], []
+def _first_frames(reflector: PathReflector, episodes: Episodes) -> Tensor:
+    """uint8 [R, V, 3, H, W], on the CPU: a third of the crops' bytes at 64 px."""
+    parts = []
     for rows in torch.arange(len(episodes)).split(_EPISODES_AT_ONCE):
-        texts = [episodes.instructions[row] for row in rows.tolist()]
-        first, view = _first_frames(reflector, episodes, rows), reflector.views_of(texts).to(poses.device)
-        seen = reflector.crops(first, view, poses[rows.to(poses.device)])
-        crops.append(((seen + 0.5) * 255).round().to(torch.uint8))
-        words, levels = reflector.vocabulary.ids(texts, poses.device), reflector.places.levels(texts)
-        points.append(reflector.places(first, view, words, levels)[1])
-    return torch.cat(crops), torch.cat(points)
+        shown = [episodes.frames(camera, rows, torch.zeros_like(rows)) for camera in reflector.cameras]
+        parts.append(torch.stack(shown, 1))
+    return torch.cat(parts)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import cast
 
 import torch
 from torch import Tensor, nn
 
-from worldenv_trl.kinematics import ActionMap
 from worldenv_trl.kinematics.calibrations import Calibrations
+from worldenv_trl.kinematics.cells import log_density
 from worldenv_trl.kinematics.planes import plane
 from worldenv_trl.reflectors.goal import Goal
 
-__all__ = ["KINDS", "Places", "offset_size", "offsets", "places_of"]
+__all__ = ["KINDS", "Places", "offsets", "places_of"]
 
 KINDS = 2  # where the hand comes down, where it is when the goal is reached
 _WAVELENGTHS = (0.24, 0.12, 0.06)  # m
@@ -24,7 +23,7 @@ _WIDTH = 0.7  # standard deviation of what a map is taught, in cells
 
 
 class Places(nn.Module):
-    """Maps of the first frame, one for each place, and the points of the table that they mean.
+    """Heat maps of the first frame, one for each keypoint or place, and the points of the table that they mean.
 
     A map is what a policy's aim is (:class:`~worldenv_trl.objectives.AimedCloning`; Transporter networks,
     arXiv:2010.14406), taught by rollouts that succeed: noise of the hand averages out, so a map finds a bowl to a
@@ -53,7 +52,6 @@ class Places(nn.Module):
         super().__init__()
         self._views, self.image_size, self.side = list(views), image_size, -(-image_size // 2)
         self._number = {text: number for number, text in enumerate(instructions)}
-        self._drawn = nn.ModuleList(ActionMap(view.distinct, image_size) for view in views)
         self.eyes = nn.ModuleList(_Eye(num_words, width) for _ in views)
         self.register_buffer("height", torch.zeros(len(instructions), KINDS))  # m
         self.register_buffer("low", torch.full((2,), -1.0))  # m: where a hand has been
@@ -90,7 +88,8 @@ class Places(nn.Module):
         return table[[self._number.get(text, len(self.height)) for text in texts]]
 
     def fit(self, points: Tensor, reached: Tensor, texts: Sequence[str], hands: Tensor) -> None:
-        """Takes heights from the places [R, K, 3] of the episodes that ``reached`` [R], and bounds from all hands."""
+        """Takes heights from the places [R, K, 3] (m) of episodes that reach the goal, ``reached`` bool [R] with one at
+        least, and bounds from all hands [R, L, 3] (m)."""
         flat = hands[..., :2].flatten(0, -2)
         self.low.copy_(flat.amin(0))
         self.high.copy_(flat.amax(0))
@@ -101,17 +100,11 @@ class Places(nn.Module):
         for text, rows in rows_of.items():
             self.height[self._number[text]] = points[rows][..., 2].median(0).values if rows else everywhere
 
-    def targets(self, points: Tensor, view: Tensor) -> Tensor:
-        """What the maps are taught of places [n, K, 3]: normal densities around where they are seen, [n, V, K, P]."""
-        cells = torch.arange(self.side, device=points.device) + 0.5
-        taught = []
-        for index, drawn in enumerate(self._drawn):
-            shown = cast(ActionMap, drawn).project(points, view[:, index : index + 1].expand(points.shape[:2]))
-            seen = shown * self.side / self.image_size
-            right, down = ((cells - each[..., None]).square() for each in seen.unbind(-1))  # [n, K, side]
-            away = down[..., :, None] + right[..., None, :]
-            taught.append((-away / (2 * _WIDTH**2)).flatten(2).softmax(-1))
-        return torch.stack(taught, 1)
+    def divergence(self, maps: Tensor, seen: Tensor) -> Tensor:
+        """KL(target, map), nats [n, V, K], of log-probabilities [n, V, K, P] from densities around where places are
+        ``seen``, [n, V, K, 2] (px)."""
+        target = log_density(seen * (self.side / self.image_size), self.side, _WIDTH)
+        return (target.exp() * (target - maps)).sum(-1)
 
 
 def places_of(hands: Tensor, reached: Tensor) -> Tensor:
@@ -130,11 +123,6 @@ def places_of(hands: Tensor, reached: Tensor) -> Tensor:
     down = (height[:, :1] - height > _FALLEN) & (fall < _STOPPED) & until
     landed = torch.where(down.any(1), down.long().argmax(1), end)
     return torch.stack([hands[rows, landed], hands[rows, end]], 1)
-
-
-def offset_size(points: int) -> int:
-    """Length of :func:`offsets` from that many points."""
-    return 2 * points + 2 * len(_WAVELENGTHS) * (2 * points + 1)
 
 
 def offsets(hands: Tensor, points: Tensor) -> Tensor:
