@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["PathLessons"]
 
 _PATH_NOISE = 0.05  # of normalised entries
+_BESIDE = 0.003  # m by which an episode's hands are moved: in the physics that hardly changes how it ends
 _LIGHT = 0.1  # standard deviation of a frame's contrast
 _EPISODES_AT_ONCE = 64
 
@@ -115,16 +116,17 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
             seen = reflector.crops(frames, view[here], poses[here])
             crops.append(((seen + 0.5) * 255).round().to(torch.uint8))
             points.append(reflector.places(frames, view[here], words[here], levels[here])[1])
-    looks, moves, apart = torch.cat(crops), reflector.moves(poses), offsets(poses[..., :3], torch.cat(points))
+    looks, moves, hands, there = torch.cat(crops), reflector.moves(poses), poses[..., :3], torch.cat(points)
 
     def sample_paths() -> TensorDict:
         rows = _drawn(tasks, plan.batch_size).to(device)
         light = 1 + _LIGHT * torch.randn(len(rows), 1, 1, 1, 1, device=device)
-        told = moves[rows]
+        told, beside = moves[rows], _BESIDE * torch.randn(len(rows), 1, 3, device=device)
+        apart = offsets(hands[rows] + beside, there[rows])
         return TensorDict(
             {
                 "crops": light * (looks[rows].float() / 255 - 0.5),
-                "path": torch.cat([told + _PATH_NOISE * torch.randn_like(told), apart[rows]], -1),
+                "path": torch.cat([told + _PATH_NOISE * torch.randn_like(told), apart], -1),
                 "words": words[rows],
                 "label": label[rows],
                 "weight": weight[rows],

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from worldenv_trl.kinematics.calibrations import Calibrations
@@ -20,6 +21,7 @@ _WAVELENGTHS = (0.24, 0.12, 0.06)  # m
 _NEAR, _FAR = 0.05, 4.0  # m that count as one, and how many at most
 _FALLEN, _STOPPED = 0.03, 0.01  # m below where it began; fall from a look to the next
 _WIDTH = 0.7  # standard deviation of what a map is taught, in cells
+_AROUND = 3  # cells beside the likeliest that a place is the mean of: four such deviations
 
 
 class Places(nn.Module):
@@ -52,7 +54,7 @@ class Places(nn.Module):
         super().__init__()
         self._views, self.image_size, self.side = list(views), image_size, -(-image_size // 2)
         self._number = {text: number for number, text in enumerate(instructions)}
-        self.eyes = nn.ModuleList(_Eye(num_words, width) for _ in views)
+        self.eyes = nn.ModuleList(_Eye(num_words, width, self.side) for _ in views)
         self.register_buffer("height", torch.zeros(len(instructions), KINDS))  # m
         self.register_buffer("low", torch.full((2,), -1.0))  # m: where a hand has been
         self.register_buffer("high", torch.ones(2))
@@ -67,10 +69,11 @@ class Places(nn.Module):
             levels: [n, K] (m), see :meth:`levels`.
 
         Returns:
-            [n, V, K, P] and [n, V * K, 2] (m): where the rays of the cells meet the places' level.
+            [n, V, K, P] and [n, V * K, 2] (m): where the rays of the cells around the likeliest meet the places'
+            level, on average.
         """
         maps = torch.stack([eye(first[:, index], words) for index, eye in enumerate(self.eyes)], 1)
-        chances = maps.exp()
+        chances = _peaks(maps, self.side)
         points = []
         for index, known in enumerate(self._views):
             met = chances.new_zeros(len(first), KINDS, self.side**2, 2)
@@ -139,22 +142,34 @@ def offsets(hands: Tensor, points: Tensor) -> Tensor:
     return torch.cat(told, -1)
 
 
-class _Eye(nn.Module):
-    """One camera's frames to log-probabilities [n, K, P] of half as many cells a side."""
+def _peaks(maps: Tensor, side: int) -> Tensor:
+    """Log-probabilities [..., P] as probabilities of the cells around the likeliest: a tenth that is left over on the
+    other side of the table would move the mean by centimetres."""
+    cells, mode = torch.arange(maps.shape[-1], device=maps.device), maps.argmax(-1, keepdim=True)
+    apart = torch.maximum((cells // side - mode // side).abs(), (cells % side - mode % side).abs())
+    return maps.masked_fill(apart > _AROUND, -math.inf).softmax(-1)
 
-    def __init__(self, num_words: int, width: int) -> None:
+
+class _Eye(nn.Module):
+    """One camera's frames to log-probabilities [n, K, P] of half as many cells a side.
+
+    Where the hand lets go of a drawer that it has opened there is nothing but table: what tells of it is the cabinet,
+    a third of the picture away. So the convolutions are dilated until each cell is told of half the picture.
+    """
+
+    def __init__(self, num_words: int, width: int, side: int) -> None:
         super().__init__()
         self.stem = nn.Sequential(
             nn.Conv2d(3, width, 5, stride=2, padding=2), nn.GELU(),
             nn.Conv2d(width, width, 3, padding=1), nn.GELU(),
         )  # fmt: skip
         self.goal = Goal(num_words, 16, width, scale=1.0)
-        self.maps = nn.Sequential(
-            nn.Conv2d(width, width, 3, padding=1), nn.GELU(),
-            nn.Conv2d(width, width, 3, padding=1), nn.GELU(),
-            nn.Conv2d(width, KINDS, 1),
-        )  # fmt: skip
+        dilations = [2**power for power in range(max(1, side // 4).bit_length())]
+        self.wider = nn.ModuleList(nn.Conv2d(width, width, 3, padding=each, dilation=each) for each in dilations)
+        self.maps = nn.Conv2d(width, KINDS, 1)
 
     def forward(self, frames: Tensor, words: Tensor) -> Tensor:
         seen = self.stem(frames.float() / 255 - 0.5) + self.goal(words)[..., None, None]
+        for layer in self.wider:
+            seen = seen + F.gelu(layer(seen))
         return self.maps(seen).flatten(2).log_softmax(-1)
