@@ -154,23 +154,11 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         ("world_model.holdout", config.world_model.holdout),
         ("reflector.imagined_share", config.reflector.imagined_share),
         ("reflector.holdout", config.reflector.holdout),
-        ("post_train.branch_share", config.post_train.branch_share),
         ("post_train.averaging", config.post_train.averaging),
         ("post_train.source_share", config.post_train.source_share),
     ):
         if share is not None and not 0 <= share <= 1:
             raise ValueError(f"{name} must lie between 0 and 1, got {share}")
-    latest = config.post_train.branch_until
-    if config.post_train.branch_share and not config.chunk_length <= latest < config.max_steps:
-        raise ValueError(
-            f"post_train.branch_until, the last step of a branch, must be at least {config.chunk_length}, "
-            f"chunk_length, and below {config.max_steps}, max_steps, got {latest}"
-        )
-    if config.post_train.branch_share and config.post_train.env == "imagined" and config.post_train.iterations < 3:
-        raise ValueError(
-            "post_train.iterations must be at least 3 with post_train.branch_share: the first and the last begin at "
-            f"initial states, got {config.post_train.iterations}"
-        )
     if not 0 <= config.post_train.momentum < 1:
         raise ValueError(f"post_train.momentum must be at least 0 and below 1, got {config.post_train.momentum}")
     if min(config.post_train.lora_lr, config.post_train.head_lr) < 0 or not config.post_train.head_lr:

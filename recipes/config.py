@@ -149,12 +149,6 @@ class PostTrain:
     iterations: int = 24
     groups: int = 24
     group_size: int = 8
-    branch_share: float = 0.0
-    """Share of the groups that begin in imagination in the middle of an explored episode, on its real frames, instead
-    of at an initial state. Waves that are recorded, the first and the last, have none: they are relived in the
-    physics."""
-    branch_until: int = 40
-    """The last step at which they begin."""
     epochs: int = 4
     minibatch_size: int = 256
     momentum: float = 0.9
@@ -312,7 +306,7 @@ _IMPROVE = WorldEnvConfig(
     ),
     explore=Explore(episodes_per_task=480),
     reflector=Reflector(choose_threshold=True, path_steps=800),
-    post_train=PostTrain(iterations=36, lora_rank=0, lora_lr=5e-5, head_lr=5e-5, branch_share=0.6, source_share=0.5),
+    post_train=PostTrain(iterations=36, lora_rank=0, lora_lr=5e-5, head_lr=5e-5, source_share=0.5),
 )
 
 

@@ -18,7 +18,7 @@ from run import Run
 from worldenv_trl import keys
 from worldenv_trl.data import Episodes
 from worldenv_trl.devices import to_device
-from worldenv_trl.envs import BranchPoints, FramesAside, ImaginedEnv, Reflect
+from worldenv_trl.envs import FramesAside, ImaginedEnv, Reflect
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.row_texts import row_texts
@@ -27,31 +27,22 @@ from worldenv_trl.world_models import WorldModel
 
 @dataclass(frozen=True)
 class Imagination:
-    """A world model, its judge, and where rollouts begin: at contexts, or at branch points where that is asked for."""
+    """A world model, its judge, and the contexts where rollouts begin."""
 
     world_model: WorldModel
     reflector: Reflector
     rule: StopRule
     contexts: TensorDict
-    branch_points: BranchPoints | None = None
 
     @classmethod
     def load(cls, run: Run, suffix: str) -> Imagination:
         """That of a round."""
         world_model = run.world_model(suffix)
-        settings = run.config.post_train
         _, explored = demonstrations_and_exploration(run, rounds=int(suffix.removeprefix("_") or 1))
-        contexts, points = contexts_of(explored, world_model.cameras), None
-        if settings.branch_share:
-            points = BranchPoints(
-                explored.through(world_model.cameras),
-                run.config.chunk_length,
-                share=settings.branch_share,
-                latest=settings.branch_until,
-            )
+        contexts = contexts_of(explored, world_model.cameras)
         rule = run.rules(suffix)["imagined"]
         judge = run.reflector(suffix).for_world("imagined")
-        return cls(world_model, judge, rule, to_device(contexts, run.device), points)
+        return cls(world_model, judge, rule, to_device(contexts, run.device))
 
     def env(
         self,
@@ -60,15 +51,14 @@ class Imagination:
         contexts: TensorDict | None = None,
         *,
         seed: int,
-        branches: bool = False,
     ) -> TransformedEnv:
         """FK, action map, world model; the reflector gives the reward and stops; frames are not carried along."""
         groups, group_size = batch_size
-        make = self.makes(run, group_size, contexts, seed=seed, branches=branches)
+        make = self.makes(run, group_size, contexts, seed=seed)
         return make(groups, transforms=[FramesAside(run.folder.scratch)])
 
     def makes(
-        self, run: Run, group_size: int, contexts: TensorDict | None = None, *, seed: int, branches: bool = False
+        self, run: Run, group_size: int, contexts: TensorDict | None = None, *, seed: int
     ) -> Callable[..., TransformedEnv]:
         """``makes(...)(groups)`` is the same env for so many groups; frames are carried along."""
         return partial(
@@ -79,7 +69,6 @@ class Imagination:
             max_steps=run.config.max_steps,
             proprio=PROPRIO,
             seed=seed,
-            branch_points=self.branch_points if branches else None,
         )
 
 

@@ -127,8 +127,6 @@ def post_train(
         waves.update_policy_weights_()
 
         metrics |= _wave_metrics(mine, returns, config.tasks)
-        if imagination is not None and imagination.branch_points is not None:
-            metrics["branched"] = processes.gathered(mine[keys.NUM_STEPS][:, 0, 0, 0] > 0).float().mean().item()
         metrics["iteration_seconds"], started = time.monotonic() - started, time.monotonic()
         if iteration in probed:
             metrics |= processes.on_main(lambda: probe(run, mean_actor, imagination, alarm))

@@ -53,14 +53,13 @@ class Waves:
     def __init__(self, run: Run, target: str, models: str, actor: LaplaceActor | AutoregressiveActor) -> None:
         settings, size = run.config.post_train, run.config.post_train.group_size
         self._groups, self._read = settings.groups // processes.size(), [*actor.policy.in_keys, *_LEARNED_FROM]
-        self._branch_share = settings.branch_share
         self._workers, seed = run.workers is not None, run.seed(target, "env")
         self.judges: dict[str, Any] = {}
         make: Callable[..., EnvBase]
         if settings.env == "imagined":
             self.imagination = Imagination.load(run, models)
-            self.env = self.imagination.env(run, [self._groups, size], seed=seed, branches=True)
-            make = self.imagination.makes(run, size, seed=seed, branches=True)
+            self.env = self.imagination.env(run, [self._groups, size], seed=seed)
+            make = self.imagination.makes(run, size, seed=seed)
             self.judges = {"world_model": self.imagination.world_model, "reflector": self.imagination.reflector}
             mine = self._groups
         elif processes.is_main():
@@ -85,10 +84,7 @@ class Waves:
 
     def record_next(self, yes: bool) -> None:
         """Waves carry what is learned from; those that are recorded carry all, and their frames go to disk. The main
-        process records, of imagination the groups that it rolled out. Those begin where the physics can follow."""
-        points = None if self.imagination is None else self.imagination.branch_points
-        if points is not None:
-            points.share = 0.0 if yes else self._branch_share
+        process records, of imagination the groups that it rolled out."""
         if self.collector is None or self.env is None:
             return
         self.collector.exclude = ["frames"] if yes else ["frames", ("next", "frames"), ("next", "observation")]

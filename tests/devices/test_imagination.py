@@ -20,7 +20,7 @@ from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.data import episodes_from_rollouts, imagine_episodes, score_episodes, window_buffer
 from worldenv_trl.devices import to_device
-from worldenv_trl.envs import BranchPoints, FramesAside, ImaginedEnv, Reflect
+from worldenv_trl.envs import FramesAside, ImaginedEnv, Reflect
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.objectives import LOOPLoss, WorldModelLoss, rloo_advantage
 from worldenv_trl.policies import DeviceBridge, laplace_actor, scale_bounds
@@ -52,15 +52,12 @@ def lived() -> TensorDict:
     return rollouts
 
 
-def wave_of(device: torch.device, seed: int = 0, branched: bool = False, **settings) -> tuple:
+def wave_of(device: torch.device, seed: int = 0, **settings) -> tuple:
     """A wave [2, 3] of greedy imagined rollouts, and what was there."""
     model, reflector, policy = (part.to(device) for part in parts(**settings))
     contexts = to_device(make_contexts(cameras=("agentview",), size=32), device)
     kinematics = ForwardKinematics().to(device)
-    points = None
-    if branched:
-        points = BranchPoints(episodes_from_rollouts(lived()), model.chunk_length, share=1.0, latest=model.chunk_length)
-    env = ImaginedEnv(model, kinematics, contexts, [2, 3], max_steps=20, seed=seed, branch_points=points)
+    env = ImaginedEnv(model, kinematics, contexts, [2, 3], max_steps=20, seed=seed)
     aside = FramesAside()
     aside.keep = True
     rule = StopRule(0.999)
@@ -70,10 +67,8 @@ def wave_of(device: torch.device, seed: int = 0, branched: bool = False, **setti
     return next(iter(collector)), aside, policy, actor, model
 
 
-@pytest.mark.parametrize("branched", [False, True], ids=["from contexts", "from the middle of an episode"])
-def test_a_wave_is_the_same_there_and_stays_there(gpu, branched):
-    (here, frames, *_), (there, others, *_) = (wave_of(each, branched=branched) for each in (torch.device("cpu"), gpu))
-    assert bool(here[keys.NUM_STEPS][:, 0, 0].any()) == branched
+def test_a_wave_is_the_same_there_and_stays_there(gpu):
+    (here, frames, *_), (there, others, *_) = (wave_of(each) for each in (torch.device("cpu"), gpu))
     for key in here.keys(True, True):
         if isinstance(here[key], torch.Tensor):
             assert there[key].device.type == "cuda", key

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from worldenv_trl.context_ids import context_id
-    from worldenv_trl.envs.branch_points import BranchPoints
     from worldenv_trl.envs.chunking import ChunkedActions, chunked
     from worldenv_trl.envs.expert import ExpertPolicy
     from worldenv_trl.envs.frames_aside import FramesAside
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
     from worldenv_trl.envs.tabletop import TabletopEnv
 
 __all__ = [
-    "BranchPoints",
     "ChunkedActions",
     "ExpertPolicy",
     "FramesAside",
@@ -33,7 +31,6 @@ __all__ = [
 ]
 
 _HOMES = {
-    "BranchPoints": "worldenv_trl.envs.branch_points",
     "ChunkedActions": "worldenv_trl.envs.chunking",
     "ExpertPolicy": "worldenv_trl.envs.expert",
     "FramesAside": "worldenv_trl.envs.frames_aside",

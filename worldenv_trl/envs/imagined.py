@@ -10,7 +10,6 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from worldenv_trl.devices import to_device
-from worldenv_trl.envs.branch_points import BranchPoints
 from worldenv_trl.envs.contexts import ContextOrder, check_contexts, context_keys
 from worldenv_trl.envs.imagined_specs import imagined_specs
 from worldenv_trl.envs.imagined_starts import ImaginedStarts
@@ -42,8 +41,6 @@ from worldenv_trl.world_models.noise_seeds import noise_seeds
 
 __all__ = ["ImaginedEnv"]
 
-_DECISIONS = 10_000  # of a rollout, at most
-
 
 class ImaginedEnv(ImaginedStarts, EnvBase):
     """Rollouts in a video world model (World-Env section 3.2): one decision, a chunk of actions, is one step.
@@ -70,9 +67,6 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
             ``"measured"`` the pose of the predicted joints.
         seed: of the contexts' order and of the noise; drawn from torch's generator when None.
         device: of the specs and buffers; the contexts' when None. World model and kinematics must be there, too.
-        branch_points: where some of the groups begin instead of at a context of their task: in the middle of an
-            episode, whose real frames are then what the world model remembers. Such a rollout cannot be replayed from
-            its recording alone, nor relived from its ``context_id``: set their ``share`` to 0 for waves that are kept.
 
     A reset of a whole group draws its next context, the tasks in turn and without replacement while that is possible;
     rows reset while others of their group are running restart their context, so that a group never mixes contexts.
@@ -105,7 +99,6 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
         proprio: str = "commanded",
         seed: int | None = None,
         device: torch.device | str | None = None,
-        branch_points: BranchPoints | None = None,
     ) -> None:
         batch = torch.Size(batch_size)
         if len(batch) != 2 or min(batch) < 1:
@@ -124,15 +117,7 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
         self.max_steps, self.chunk_length, self.proprio = int(max_steps), world_model.chunk_length, proprio
         self._contexts = contexts.select(*context_keys(self.cameras)).to(device).contiguous()
         self._instructions = instructions_of(contexts)
-        self._order, self.branch_points = ContextOrder(contexts), branch_points
-        if branch_points is not None:
-            branch_points.episodes.require("the world model", world_model.cameras, world_model.image_size)
-            if branch_points.chunk_length != self.chunk_length or branch_points.latest >= self.max_steps:
-                raise ValueError(
-                    f"branch_points has chunk_length={branch_points.chunk_length} and latest={branch_points.latest}, "
-                    f"the rollouts have chunks of {self.chunk_length} and max_steps={self.max_steps}: the chunks must "
-                    "be the same, and latest below max_steps"
-                )
+        self._order = ContextOrder(contexts)
         specs = imagined_specs(batch, self.cameras, self.image_size, self.chunk_length, self._instructions[0], device)
         self.observation_spec, self.state_spec, self.action_spec, self.reward_spec, self.done_spec = specs
         self._make_buffers()
@@ -159,10 +144,8 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
         buffer("_context", 1, dtype=torch.int64)
         buffer("_steps", dtype=torch.int64)
         buffer("_decisions", dtype=torch.int64)
-        buffer("_point", dtype=torch.int64)
         buffer("_episode", dtype=torch.int64)  # which noise; 0 for contexts given by the caller
         buffer("_resets", dtype=torch.int64)
-        self._point.fill_(-1)
         self._text = [self._instructions[0]] * rows
         self._text_stack: NonTensorStack | None = None
         self._begun = [False] * self.batch_size[0]  # groups that have a context
@@ -197,7 +180,6 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
             starts = self.draw_starts() if starts is None else starts
             self._resets.copy_(starts["episode"].flatten())
         if set_state:
-            self._point[rows] = -1
             self._load(rows, *self._given(tensordict, rows))
             self._episode[rows] = 0
         else:
@@ -304,8 +286,7 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
         return chunk.detach().to(self.device, torch.float32).flatten(0, 1)
 
     def _noise_seeds(self, rows: Tensor) -> Tensor:
-        place = self._decisions[rows] + _DECISIONS * (self._point[rows] + 1)
-        parts = (self._context[rows, 0], rows % self.batch_size[1], self._episode[rows], place)
+        parts = (self._context[rows, 0], rows % self.batch_size[1], self._episode[rows], self._decisions[rows])
         return noise_seeds(self._seed, *parts).unsqueeze(-1)
 
     def _observe(self, *, frames: bool = True) -> TensorDictBase:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -116,31 +115,10 @@ class Reflect(Transform):
             there = device_of(self.reflector, device)
             state = self.reflector.begin({name: shown[rows].to(there) for name, shown in images.items()}, goals)
             self._check("begin", "state['score']", tuple(state["score"].shape), (len(rows),))
-            state = self._seen_before(rows, state, goals, there)
             memory["state"] = _merged(memory["state"], rows, state, count)
             memory["prob"][rows], memory["streak"][rows] = state["score"].float().to(device), 0
         tensordict_reset[SUCCESS_PROB] = memory["prob"].reshape(*batch, 1).clone()
         return tensordict_reset
-
-    def _seen_before(
-        self, rows: Tensor, state: TensorDictBase, goals: Sequence[str], device: torch.device
-    ) -> TensorDictBase:
-        """The state of ``rows`` [n] where some of their rollouts go on from the middle of an episode, which is theirs,
-        too; no rule looks at it."""
-        past = getattr(self.parent, "past", None)
-        for some, video in () if past is None else past(rows):
-            shown = {camera: video[frames_key(camera)] for camera in self.reflector.cameras}
-            if self.reflector.reads_path:
-                shown[KINEMATIC_STATES] = video[KINEMATIC_STATES]
-            shown = {name: values.to(device) for name, values in shown.items()}
-            begun = self.reflector.begin(
-                {name: values[:, 0] for name, values in shown.items()}, [goals[i] for i in some]
-            )
-            read = [*(self.reflector.cameras if self.reflector.reads_video else ()), KINEMATIC_STATES]
-            later = {name: values[:, 1:] for name, values in shown.items() if name in read}
-            lived, _ = self.reflector.extend(begun, later)
-            state = _merged(state, some.to(device), lived, len(rows))
-        return state
 
     # ------------------------------------------------------------------------------------------------- step
 

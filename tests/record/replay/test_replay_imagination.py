@@ -13,8 +13,7 @@ from torchrl.envs import TransformedEnv
 
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
-from worldenv_trl.data import episodes_from_rollouts
-from worldenv_trl.envs import BranchPoints, ExpertPolicy, ImaginedEnv, Reflect, TabletopEnv
+from worldenv_trl.envs import ExpertPolicy, ImaginedEnv, Reflect, TabletopEnv
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.record import (
     RolloutWriter,
@@ -122,21 +121,6 @@ def test_the_recorded_model_paints_the_same_frames_from_the_recorded_seeds(tmp_p
     assert not torch.equal(wave["next", *FRAMES][0], wave["next", *FRAMES][1])  # noise tells them apart
     again = replay(report.target, 0, world_model=model, write=False)
     assert again.exact is True
-
-
-def test_a_rollout_that_branched_from_an_episode_is_refused(tmp_path):
-    physics = TabletopEnv(TASK, 2, image_size=SIZE, seed=0, proprio="commanded", max_steps=16)
-    points = BranchPoints(episodes_from_rollouts(physics.rollout(16)), C, share=1.0, latest=C)
-    env = ImaginedEnv(
-        Painter(), ForwardKinematics(), physics.reset().exclude("done", "terminated", "truncated"), [2, 2],
-        max_steps=16, seed=3, branch_points=points,
-    )  # fmt: skip
-    wave = next(iter(GroupCollector(env, closing(4), groups_per_batch=2)))
-    with RolloutWriter(tmp_path / "a.mcap", **provenance(env, models={"world_model": Painter()}, tasks=[TASK])) as file:
-        file.write(wave)
-    for options in ({"world_model": Painter()}, {"mode": "physics"}, {"world_model": Painter(), "from_step": 99}):
-        with pytest.raises(ValueError, match=r"rollout 1 of .* branched from step 4 of a recorded episode"):
-            replay(tmp_path / "a.mcap", 1, **options)
 
 
 def test_every_camera_of_the_model_is_replayed_and_compared(tmp_path):
