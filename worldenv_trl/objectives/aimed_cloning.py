@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from worldenv_trl.keys import ACTION_IS_PAD, WAYPOINT
 from worldenv_trl.kinematics import ActionMap
 from worldenv_trl.kinematics.calibrations import Calibrations, check_instructions, plain_cameras
-from worldenv_trl.kinematics.cells import log_density
+from worldenv_trl.kinematics.densities import log_density
 from worldenv_trl.language import instructions_of
 from worldenv_trl.policies.base import Aims
 from worldenv_trl.robot import Camera

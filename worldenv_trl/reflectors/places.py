@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from worldenv_trl.kinematics.calibrations import Calibrations
-from worldenv_trl.kinematics.cells import log_density
+from worldenv_trl.kinematics.densities import log_density
 from worldenv_trl.kinematics.planes import plane
 from worldenv_trl.reflectors.goal import Goal
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from worldenv_trl.kinematics.cells import log_density
+from worldenv_trl.kinematics.densities import log_density
 
 
 def test_a_density_sums_to_one_and_lies_around_its_point():
