@@ -41,7 +41,6 @@ class ImaginedStarts(GivenStarts):
     _poses: Tensor
     _resets: Tensor
     _seed: int
-    _slot: Tensor
     _state: Tensor
     _steps: Tensor
     _task: Tensor

@@ -143,8 +143,8 @@ def offsets(hands: Tensor, points: Tensor) -> Tensor:
 
 
 def _peaks(maps: Tensor, side: int) -> Tensor:
-    """Log-probabilities [..., P] as probabilities of the cells around the likeliest: a tenth that is left over on the
-    other side of the table would move the mean by centimetres."""
+    """Log-probabilities [..., P] as those of the cells around the likeliest alone, [..., P] (a local soft-argmax's
+    weights): a tenth that is left over on the other side of the table would move the mean by centimetres."""
     cells, mode = torch.arange(maps.shape[-1], device=maps.device), maps.argmax(-1, keepdim=True)
     apart = torch.maximum((cells // side - mode // side).abs(), (cells % side - mode % side).abs())
     return maps.masked_fill(apart > _AROUND, -math.inf).softmax(-1)
@@ -154,7 +154,8 @@ class _Eye(nn.Module):
     """One camera's frames to log-probabilities [n, K, P] of half as many cells a side.
 
     Where the hand lets go of a drawer that it has opened there is nothing but table: what tells of it is the cabinet,
-    a third of the picture away. So the convolutions are dilated until each cell is told of half the picture.
+    a third of the picture away. So the convolutions are dilated (arXiv:1511.07122) until each cell is told of half the
+    picture.
     """
 
     def __init__(self, num_words: int, width: int, side: int) -> None:

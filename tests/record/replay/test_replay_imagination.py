@@ -123,6 +123,16 @@ def test_the_recorded_model_paints_the_same_frames_from_the_recorded_seeds(tmp_p
     assert again.exact is True
 
 
+def test_a_rollout_that_does_not_begin_at_its_beginning_is_refused(tmp_path):
+    wave = imagine(tmp_path / "a.mcap", Painter())
+    about = provenance(imagined(Painter(), 16), models={"world_model": Painter()}, tasks=[TASK])
+    with RolloutWriter(tmp_path / "later.mcap", **about) as file:
+        file.write(wave[:, :, 1:])
+    for options in ({"world_model": Painter()}, {"mode": "physics"}, {"world_model": Painter(), "from_step": 99}):
+        with pytest.raises(ValueError, match=f"rollout 1 of .* begins at step {C}: the world model remembers"):
+            replay(tmp_path / "later.mcap", 1, **options)
+
+
 def test_every_camera_of_the_model_is_replayed_and_compared(tmp_path):
     model = Painter(cameras=("agentview", "wrist"))
     wave = imagine(tmp_path / "a.mcap", model).reshape(-1, 4)

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from worldenv_trl.devices import device_of
-from worldenv_trl.keys import FRAMES, MASK, SUCCESS, SUCCESS_PROB
+from worldenv_trl.keys import FRAMES, MASK, NUM_STEPS, SUCCESS, SUCCESS_PROB
 from worldenv_trl.record.mcap.provenance import model_hash, package_versions
 from worldenv_trl.record.mcap.reader import list_rollouts, read_attachments, read_rollouts
 from worldenv_trl.record.mcap.recording import Recording
@@ -100,6 +100,12 @@ def replay(
         (True, 'what-if', 4)
     """
     source = open_rollout(path, rollout)
+    begun = source.entries[0].get(NUM_STEPS, None)
+    if source.imagined and begun is not None and int(begun):
+        raise ValueError(
+            f"rollout {source.number} of {source.path} begins at step {int(begun)}: the world model remembers frames "
+            "before it, which it does not hold, so it cannot be lived again. Record rollouts from their beginning"
+        )
     mode = mode or ("imagination" if source.imagined else "physics")
     branch = _branch(source, mode, world_model, reflector, from_step, policy, seed, threshold, edits or {})
     kind = "what-if" if branch else "exact"
