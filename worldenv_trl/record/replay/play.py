@@ -81,8 +81,9 @@ def replay(
         overwrite: replace a file of that name.
 
     Raises:
-        FileNotFoundError, ValueError: as :func:`~worldenv_trl.record.read_rollouts`; for a rollout without actions, a
-            step that it does not have, a part that is missing, or a change that can have no effect.
+        FileNotFoundError, ValueError: as :func:`~worldenv_trl.record.read_rollouts`; for a rollout without actions, an
+            imagined one whose first steps are not in the file, a step that it does not have, a part that is missing,
+            or a change that can have no effect.
         FileExistsError: if the new file exists.
 
     Examples:
@@ -104,7 +105,7 @@ def replay(
     if source.imagined and begun is not None and int(begun):
         raise ValueError(
             f"rollout {source.number} of {source.path} begins at step {int(begun)}: the world model remembers frames "
-            "before it, which it does not hold, so it cannot be lived again. Record rollouts from their beginning"
+            "before it, which the file does not hold, so it cannot be replayed. Record rollouts from their beginning"
         )
     mode = mode or ("imagination" if source.imagined else "physics")
     branch = _branch(source, mode, world_model, reflector, from_step, policy, seed, threshold, edits or {})
