@@ -16,6 +16,7 @@ from worldenv_trl.reflectors import StopRule
 from worldenv_trl.scenes import load_task
 
 _FARTHEST_SHIFT_M = 0.2
+_FARTHEST_REPLAY_M = 0.2
 _FARTHEST_PLACE_M = 0.035  # of the radii that policies.PlaceShift has by default
 
 
@@ -148,6 +149,13 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     if not config.explore.scale_factors or min(config.explore.scale_factors) < 0:
         raise ValueError(
             f"explore.scale_factors must be one number or more, none negative, got {config.explore.scale_factors}"
+        )
+    if not 0 <= config.explore.replay_share < 1:
+        raise ValueError(f"explore.replay_share must lie in [0, 1), got {config.explore.replay_share}")
+    if not 0 <= config.explore.replay_shift_m <= _FARTHEST_REPLAY_M:
+        raise ValueError(
+            f"explore.replay_shift_m must lie between 0 and {_FARTHEST_REPLAY_M} (m), got "
+            f"{config.explore.replay_shift_m}: farther, a hand leaves the table"
         )
     for name, share in (
         ("world_model.failure_share", config.world_model.failure_share),

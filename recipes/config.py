@@ -81,13 +81,18 @@ class SFT:
 
 @dataclass(frozen=True)
 class Explore:
-    """The policy's own rollouts in the scenes, at several multiples of its trained scale: data for both models."""
+    """The policy's own rollouts in the scenes, perturbed: data for both models."""
 
     episodes_per_task: int = 160
-    """Rounded up to whole waves of ``num_envs`` for each scale factor."""
+    """Those that are not played again are rounded up to whole waves of ``num_envs`` for each scale factor."""
     scale_factors: tuple[float, ...] = (0.0, 0.5, 1.0, 2.0)
     """Multiples of the policy's Laplace scale, or of its temperature if it acts by tokens; the episodes are shared out
     equally. 0 is the greedy policy."""
+    replay_share: float = 0.25
+    """Share of the episodes that play successes among the others again, the hand moved to one side: noise alone does
+    not show what a smooth path beside the right one comes to, and smooth is what LOOP makes a policy."""
+    replay_shift_m: float = 0.08
+    """The farthest that a hand is moved there (m), in any direction over the table."""
     num_envs: int = 32
 
 

@@ -1,4 +1,5 @@
-"""The policy's own rollouts in the scenes at several multiples of its trained scale, labelled by the physics.
+"""The policy's own rollouts in the scenes at several multiples of its trained scale, then successes among them moved to
+one side, labelled by the physics.
 
 Alone: ``python recipes/explore.py improve --run-dir runs/improve``.
 """
@@ -10,7 +11,9 @@ from types import SimpleNamespace
 from typing import Any
 
 from collecting import of_worker
+from config import Explore
 from physics import chunk_player, exploring_actor, recording, step_env
+from replayed import Successes, play_again, replays_per_task
 from resumable import Outside, Resumable
 from resumable_recording import ResumableRecording
 from run import Run
@@ -23,8 +26,7 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
     config, folder, settings = run.config, run.folder, run.config.explore
     run.seed_everything(target)
     model = run.policy(policy).eval()
-    per_scale = -(-settings.episodes_per_task * len(config.tasks) // len(settings.scale_factors))
-    waves = -(-per_scale // settings.num_envs)
+    waves, successes = waves_per_scale(settings, len(config.tasks)), Successes(config.max_steps)
     # After success the rollout goes on: the models must see what undoes it (World-Env Figure 6).
     options: dict[str, Any] = {
         "terminate_on_success": False,
@@ -52,12 +54,19 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
             )
             reached: list[float] = []
             left = Resumable(
-                run, f"scale_{number}", waves, collector=progress, recording=Outside(recorded), reached=reached
+                run,
+                f"scale_{number}",
+                waves,
+                collector=progress,
+                recording=Outside(recorded),
+                reached=reached,
+                successes=successes,
             )
             collected = iter(collector)
             for _ in left.bar(f"{target} scale x{factor:g}", "wave"):
                 rollouts = next(collected)[:, 0]
                 recorded.writer.write(rollouts)
+                successes.note(rollouts)
                 reached.append(
                     (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1).float().mean().item()
                 )
@@ -65,7 +74,14 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
             folder.log(
                 target, scale_factor=factor, episodes=waves * settings.num_envs, success=sum(reached) / len(reached)
             )
+        play_again(run, model, successes, recorded, target)
     env.close()
+
+
+def waves_per_scale(settings: Explore, tasks: int) -> int:
+    """Of ``num_envs`` rollouts; what is played again comes on top."""
+    episodes = (settings.episodes_per_task - replays_per_task(settings)) * tasks
+    return -(-episodes // (len(settings.scale_factors) * settings.num_envs))
 
 
 if __name__ == "__main__":

@@ -6,9 +6,11 @@ import math
 from dataclasses import dataclass
 
 from config import WorldEnvConfig
+from explore import waves_per_scale
 from part_costs import Call, Size
 from probes import probed_iterations
 from rehearsal import Rehearsal
+from replayed import replays_per_task
 from stages import Stage, plan
 from updates import rows_at_once
 from worldenv_trl.reflectors import VLMLessons, VLMReflectorConfig
@@ -97,9 +99,9 @@ def decisions(config: WorldEnvConfig) -> int:
 
 def explored(config: WorldEnvConfig) -> int:
     """Episodes of a round of exploration, rounded up to whole waves."""
-    settings = config.explore
-    per_scale = -(-settings.episodes_per_task * len(config.tasks) // len(settings.scale_factors))
-    return -(-per_scale // settings.num_envs) * settings.num_envs * len(settings.scale_factors)
+    settings, tasks = config.explore, len(config.tasks)
+    waves = waves_per_scale(settings, tasks) * len(settings.scale_factors)
+    return waves * settings.num_envs + replays_per_task(settings) * tasks
 
 
 def iteration_flops(config: WorldEnvConfig, found: Rehearsal) -> float:

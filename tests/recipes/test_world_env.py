@@ -59,6 +59,8 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"demonstrate": Demonstrate(51, states="spread")}, "demonstrate.episodes_per_task must be at most 50, train_"),
         ({"demonstrate": Demonstrate(episodes_per_task=0)}, "demonstrate.episodes_per_task must be at least 1"),
         ({"explore": Explore(scale_factors=())}, "explore.scale_factors"),
+        ({"explore": Explore(replay_share=1.0)}, "explore.replay_share must lie in"),
+        ({"explore": Explore(replay_shift_m=0.5)}, "explore.replay_shift_m must lie between 0 and 0.2"),
         (
             {"post_train": PostTrain(ratio_level="token")},
             "ratio_level must be step or chunk for OFTPolicy, which does not",

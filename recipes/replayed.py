@@ -1,0 +1,152 @@
+"""Successes of exploration played again, the hand moved to one side: how far beside a path still succeeds.
+
+Noise of the actions makes a path jagged, and what LOOP makes of a policy is smooth: a judge that has seen only the
+first sort takes smoothness for success, wherever the hand goes. What a smooth path beside the right one comes to is
+seen here, and labelled by the physics.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.modules import MultiStepActorWrapper
+
+from physics import chunk_player, exploring_actor, step_env
+from resumable import Outside, Resumable
+from worldenv_trl import keys
+from worldenv_trl.collectors import GroupCollector
+from worldenv_trl.envs import context_id
+from worldenv_trl.scenes import load_task
+
+if TYPE_CHECKING:
+    from config import Explore
+    from resumable_recording import ResumableRecording
+    from run import Run
+    from worldenv_trl.policies import Policy
+
+MOVED_IN = 12  # steps: before a hand has come down
+
+
+def replays_per_task(settings: Explore) -> int:
+    """Of exploration's episodes of a task, those that are played again."""
+    return round(settings.replay_share * settings.episodes_per_task)
+
+
+class Successes:
+    """The rollouts of at most ``max_steps`` steps that reached the goal: where they began, and what was done."""
+
+    def __init__(self, max_steps: int) -> None:
+        self._max_steps = max_steps
+        self._parts: list[TensorDictBase] = []
+
+    def note(self, rollouts: TensorDictBase) -> None:
+        """Takes those of ``rollouts`` [n, T] that succeed."""
+        mask = rollouts[keys.MASK]
+        reached = (rollouts["next", keys.SUCCESS].squeeze(-1) & mask).any(-1)
+        actions = rollouts[keys.ACTION] * mask.unsqueeze(-1)
+        begun = rollouts.select(keys.CONTEXT_ID, keys.TASK_ID)[:, 0]
+        parts = {name: begun[name].squeeze(-1) for name in (keys.CONTEXT_ID, keys.TASK_ID)}
+        parts["actions"] = F.pad(actions, (0, 0, 0, self._max_steps - actions.shape[1]))
+        self._parts.append(TensorDict(parts, batch_size=[len(mask)])[reached])
+
+    def of_task(self, number: int) -> TensorDictBase:
+        """``actions`` [n, T, 7], ``context_id`` and ``task_id`` int64 [n]."""
+        every = TensorDict.cat(self._parts)
+        return every[every[keys.TASK_ID] == number]
+
+    def state_dict(self) -> dict[str, Any]:
+        return TensorDict.cat(self._parts).to_dict() if self._parts else {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self._parts = [TensorDict.from_dict(state_dict, auto_batch_size=True)] if state_dict else []
+
+
+def moved_aside(actions: Tensor, shifts: Tensor) -> Tensor:
+    """Actions [n, T, 7] that take the hand to the same path moved by ``shifts`` [n, 2] (m, x and y), and there."""
+    moved = actions.clone()
+    count = min(MOVED_IN, actions.shape[1])
+    moved[:, :count, :2] += shifts.unsqueeze(1) / (count * keys.POSITION_STEP)
+    return moved.clamp(-1, 1)
+
+
+def play_again(run: Run, policy: Policy, successes: Successes, recorded: ResumableRecording, target: str) -> None:
+    """Plays successes drawn of every task again, each moved by up to ``replay_shift_m``, and records them.
+
+    The recording shows what was done as ``action``, and beside it what ``policy`` would have done. A task without a
+    success has nothing to be played again.
+    """
+    config, settings = run.config, run.config.explore
+    drawn = torch.Generator().manual_seed(run.seed(target, "replays"))
+    waves = [wave for number in range(len(config.tasks)) for wave in _drawn(successes.of_task(number), settings, drawn)]
+    player = chunk_player(exploring_actor(config, policy, 1e-6), config.chunk_length)
+    reached: list[float] = []
+    left = Resumable(run, "replays", len(waves), recording=Outside(recorded), reached=reached)
+    for index in left.bar(f"{target} moved aside", "wave"):
+        wave = waves[index]
+        name = config.tasks[int(wave[keys.TASK_ID][0])]
+        contexts = wave[keys.CONTEXT_ID].tolist()
+        starts = [each - context_id(config.tasks.index(name), "train", 0) for each in contexts]
+        env = step_env(
+            config,
+            "train",
+            len(wave),
+            [name],
+            init_states=load_task(name).init_states("train", max(starts) + 1)[starts],
+            context_ids=contexts,
+            init_state_mode="cycle",
+            terminate_on_success=False,
+            with_sim_state=True,
+        )
+        collector = GroupCollector(
+            env,
+            _Replay(player, wave["actions"]),
+            groups_per_batch=len(wave),
+            total_groups=len(wave),
+            group_size=1,
+            max_decisions=config.max_steps,
+        )
+        rollouts = next(iter(collector))[:, 0]
+        recorded.writer.write(rollouts)
+        reached += (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1).tolist()
+        collector.shutdown()
+    if reached:
+        run.folder.log(
+            target, replay_shift_m=settings.replay_shift_m, episodes=len(reached), success=sum(reached) / len(reached)
+        )
+
+
+def _drawn(found: TensorDictBase, settings: Explore, drawn: torch.Generator) -> Iterator[TensorDictBase]:
+    """Waves of a task's successes to be played again, with the actions that move them."""
+    count = replays_per_task(settings)
+    if not count or not len(found):
+        return
+    uniform = partial(torch.rand, count, generator=drawn)
+    rows = (uniform() * len(found)).long().clamp(max=len(found) - 1)
+    angle, far = 2 * math.pi * uniform(), settings.replay_shift_m * uniform()
+    chosen = found[rows].clone()
+    chosen["actions"] = moved_aside(chosen["actions"], far.unsqueeze(-1) * torch.stack([angle.cos(), angle.sin()], -1))
+    waves = -(-count // settings.num_envs)
+    yield from chosen.split(-(-count // waves))
+
+
+class _Replay(TensorDictModuleBase):
+    """What ``player`` says, and the actions [n, T, 7] instead of its own; for one rollout."""
+
+    def __init__(self, player: MultiStepActorWrapper, actions: Tensor) -> None:
+        super().__init__()
+        self.player, self.actions, self._step = player, actions, 0
+        self.in_keys, self.out_keys = player.in_keys, player.out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = self.player(tensordict)
+        tensordict[keys.ACTION] = self.actions[:, self._step]
+        self._step += 1
+        return tensordict
