@@ -61,12 +61,14 @@ def test_what_cannot_be_measured_is_refused(name, settings, message, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["damage", "expert", "group_signal", "kill", "record", "replay", "scenes", "sft", "throughput"]
+    "name", ["beside", "damage", "expert", "group_signal", "kill", "record", "replay", "scenes", "sft", "throughput"]
 )
 def test_every_benchmark_takes_the_number_of_threads(name, tmp_path):
     module = benchmark(name)
     kind = module.Settings if hasattr(module, "Settings") else module.Benchmark
-    needed = {"sft": {"run_dir": tmp_path / "run"}, "group_signal": {"run": tmp_path}}.get(name, {})
+    needed = {"sft": {"run_dir": tmp_path / "run"}, "group_signal": {"run": tmp_path}, "beside": {"run": tmp_path}}.get(
+        name, {}
+    )
     with pytest.raises(SystemExit, match=r"num[_-]threads must be at least 1, got 0"):
         module.main(kind(num_threads=0, **needed))
 
