@@ -89,10 +89,10 @@ class Explore:
     """Multiples of the policy's Laplace scale, or of its temperature if it acts by tokens; the episodes are shared out
     equally. 0 is the greedy policy."""
     replay_share: float = 0.25
-    """Share of the episodes that play successes among the others again, the hand moved to one side: noise alone does
-    not show what a smooth path beside the right one comes to, and smooth is what LOOP makes a policy."""
+    """Share of the episodes that play successes among the others again, the hand moved aside: noise alone does not show
+    what a smooth path beside the right one comes to, and smooth is what LOOP makes a policy."""
     replay_shift_m: float = 0.08
-    """The farthest that a hand is moved there (m), in any direction over the table."""
+    """The farthest that a hand is moved there (m), in any direction."""
     num_envs: int = 32
 
 

@@ -1,5 +1,5 @@
-"""The policy's own rollouts in the scenes at several multiples of its trained scale, then successes among them moved to
-one side, labelled by the physics.
+"""The policy's own rollouts in the scenes at several multiples of its trained scale, then successes among them moved
+aside, labelled by the physics.
 
 Alone: ``python recipes/explore.py improve --run-dir runs/improve``.
 """

@@ -1,15 +1,13 @@
-"""Successes of exploration played again, the hand moved to one side: how far beside a path still succeeds.
+"""Successes of exploration played again, the hand moved aside: how far beside a path still succeeds.
 
 Noise of the actions makes a path jagged, and what LOOP makes of a policy is smooth: a judge that has seen only the
-first sort takes smoothness for success, wherever the hand goes. What a smooth path beside the right one comes to is
-seen here, and labelled by the physics.
+first sort takes smoothness for success, wherever the hand goes. What a smooth path beside the right one, above or below
+it comes to is seen here, and labelled by the physics.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -69,11 +67,16 @@ class Successes:
         self._parts = [TensorDict.from_dict(state_dict, auto_batch_size=True)] if state_dict else []
 
 
+def directions(count: int, drawn: torch.Generator) -> Tensor:
+    """Unit vectors [n, 3], all directions alike."""
+    return F.normalize(torch.randn(count, 3, generator=drawn), dim=-1)
+
+
 def moved_aside(actions: Tensor, shifts: Tensor) -> Tensor:
-    """Actions [n, T, 7] that take the hand to the same path moved by ``shifts`` [n, 2] (m, x and y), and there."""
+    """Actions [n, T, 7] that take the hand to the same path moved by ``shifts`` [n, 3] (m), and along it."""
     moved = actions.clone()
     count = min(MOVED_IN, actions.shape[1])
-    moved[:, :count, :2] += shifts.unsqueeze(1) / (count * keys.POSITION_STEP)
+    moved[:, :count, :3] += shifts.unsqueeze(1) / (count * keys.POSITION_STEP)
     return moved.clamp(-1, 1)
 
 
@@ -128,11 +131,9 @@ def _drawn(found: TensorDictBase, settings: Explore, drawn: torch.Generator) -> 
     count = replays_per_task(settings)
     if not count or not len(found):
         return
-    uniform = partial(torch.rand, count, generator=drawn)
-    rows = (uniform() * len(found)).long().clamp(max=len(found) - 1)
-    angle, far = 2 * math.pi * uniform(), settings.replay_shift_m * uniform()
-    chosen = found[rows].clone()
-    chosen["actions"] = moved_aside(chosen["actions"], far.unsqueeze(-1) * torch.stack([angle.cos(), angle.sin()], -1))
+    chosen = found[torch.randint(len(found), (count,), generator=drawn)].clone()
+    far = settings.replay_shift_m * torch.rand(count, 1, generator=drawn)
+    chosen["actions"] = moved_aside(chosen["actions"], far * directions(count, drawn))
     waves = -(-count // settings.num_envs)
     yield from chosen.split(-(-count // waves))
 

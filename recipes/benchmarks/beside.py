@@ -1,15 +1,14 @@
 """How far beside a path that succeeds another one still does, in the physics and in the eyes of the path's judge.
 
 ``python recipes/benchmarks/beside.py runs/improve``. Explored rollouts that reached the goal, from initial states that
-the judge was not trained on, are played again with the hand moved to one side by so many centimetres, in a direction
-drawn for each; what the physics makes of it is held against R at the end of the same path. Noise moves a hand to and
+the judge was not trained on, are played again with the hand moved by so many centimetres, in a direction drawn for
+each; what the physics makes of it is held against R at the end of the same path. Noise moves a hand to and
 fro, what LOOP does to a policy moves it to one side: where R does not fall as success does, LOOP is led astray.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from command_line import at_least, refusals
 from episodes import demonstrations_and_exploration, split_by_context
 from explore import waves_per_scale
 from gather_evidence import read_config
-from replayed import moved_aside
+from replayed import directions, moved_aside
 from run import Run
 from run_folder import RunFolder
 from threads import use_threads
@@ -106,9 +105,8 @@ def measure(run: Run, judge: Any, successes: Episodes, settings: Settings) -> di
     rows |= {name: task == number for number, name in enumerate(run.config.tasks)}
     out: dict[str, Any] = {name: {"paths": int(chosen.sum()), "at": {}} for name, chosen in rows.items()}
     for distance in settings.distances:
-        angle = 2 * math.pi * torch.rand(len(successes), generator=drawn)
-        shifts = distance * torch.stack([angle.cos(), angle.sin()], -1)
-        moved, episodes = moved_aside(successes["actions"], shifts), successes[:]
+        moved = moved_aside(successes["actions"], distance * directions(len(successes), drawn))
+        episodes = successes[:]
         after = run.kinematics.rollout(first, moved)
         episodes["actions"], episodes["kinematic_states"] = moved, torch.cat([first.unsqueeze(1), after], 1)
         reached = relive(run, _entries(episodes)).any(-1)

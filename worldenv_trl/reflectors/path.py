@@ -105,8 +105,8 @@ class PathReflector(Reflector, Pretrained):
     they say so far, give R of every prefix. It learns from real rollouts which path fails in which scene, and reads
     nothing that a world model paints, so ghosts of success cannot mislead it; what happens otherwise than commanded it
     does not see either. It must have seen smooth paths fail: where noise alone made them fail, smoothness is what it
-    learns to call success, wherever the hand goes. A hand view is what others predict as a second camera (Ctrl-World, 2510.10125); success told
-    for every frame is the reward head of World-VLA-Loop (2602.06508).
+    learns to call success, wherever the hand goes. A hand view is what others predict as a second camera (Ctrl-World,
+    2510.10125); success told for every frame is the reward head of World-VLA-Loop (2602.06508).
 
     Args:
         config: cameras and sizes.
