@@ -84,13 +84,14 @@ class Explore:
     """The policy's own rollouts in the scenes, perturbed: data for both models."""
 
     episodes_per_task: int = 160
-    """Those that are not played again are rounded up to whole waves of ``num_envs`` for each scale factor."""
+    """Those that are no replays are rounded up to whole waves of ``num_envs`` for each scale factor."""
     scale_factors: tuple[float, ...] = (0.0, 0.5, 1.0, 2.0)
     """Multiples of the policy's Laplace scale, or of its temperature if it acts by tokens; the episodes are shared out
     equally. 0 is the greedy policy."""
-    replay_share: float = 0.25
+    replay_share: float = 0.0
     """Share of the episodes that play successes among the others again, the hand moved aside: noise alone does not show
-    what a smooth path beside the right one comes to, and smooth is what LOOP makes a policy."""
+    what a smooth path beside the right one comes to, and smooth is what LOOP makes a policy. 0 until LOOP has been
+    better with it on three seeds (``RESULTS.md``); .25 is what was measured."""
     replay_shift_m: float = 0.08
     """The farthest that a hand is moved there (m), in any direction."""
     num_envs: int = 32

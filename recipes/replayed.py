@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from run import Run
     from worldenv_trl.policies import Policy
 
-MOVED_IN = 12  # steps: before a hand has come down
+MOVED_IN = 12  # steps: from the start, before a hand has come down
+_LATE = 0.5  # share that begins to be moved on the way: what is taken hold of rightly may be carried elsewhere
 
 
 def replays_per_task(settings: Explore) -> int:
@@ -39,7 +40,8 @@ def replays_per_task(settings: Explore) -> int:
 
 
 class Successes:
-    """The rollouts of at most ``max_steps`` steps that reached the goal: where they began, and what was done."""
+    """The rollouts of at most ``max_steps`` steps that reached the goal: where they began, what was done, and when they
+    had."""
 
     def __init__(self, max_steps: int) -> None:
         self._max_steps = max_steps
@@ -48,15 +50,16 @@ class Successes:
     def note(self, rollouts: TensorDictBase) -> None:
         """Takes those of ``rollouts`` [n, T] that succeed."""
         mask = rollouts[keys.MASK]
-        reached = (rollouts["next", keys.SUCCESS].squeeze(-1) & mask).any(-1)
+        success = rollouts["next", keys.SUCCESS].squeeze(-1) & mask
         actions = rollouts[keys.ACTION] * mask.unsqueeze(-1)
         begun = rollouts.select(keys.CONTEXT_ID, keys.TASK_ID)[:, 0]
         parts = {name: begun[name].squeeze(-1) for name in (keys.CONTEXT_ID, keys.TASK_ID)}
         parts["actions"] = F.pad(actions, (0, 0, 0, self._max_steps - actions.shape[1]))
-        self._parts.append(TensorDict(parts, batch_size=[len(mask)])[reached])
+        parts["reached"] = success.long().argmax(-1)
+        self._parts.append(TensorDict(parts, batch_size=[len(mask)])[success.any(-1)])
 
     def of_task(self, number: int) -> TensorDictBase:
-        """``actions`` [n, T, 7], ``context_id`` and ``task_id`` int64 [n]."""
+        """``actions`` [n, T, 7], and ``context_id``, ``task_id`` and ``reached``, the step that does, int64 [n]."""
         every = TensorDict.cat(self._parts)
         return every[every[keys.TASK_ID] == number]
 
@@ -72,11 +75,14 @@ def directions(count: int, drawn: torch.Generator) -> Tensor:
     return F.normalize(torch.randn(count, 3, generator=drawn), dim=-1)
 
 
-def moved_aside(actions: Tensor, shifts: Tensor) -> Tensor:
-    """Actions [n, T, 7] that take the hand to the same path moved by ``shifts`` [n, 3] (m), and along it."""
+def moved_aside(actions: Tensor, shifts: Tensor, begin: Tensor | None = None) -> Tensor:
+    """Actions [n, T, 7] that take the hand to the same path moved by ``shifts`` [n, 3] (m), and along it, from the step
+    ``begin`` int64 [n] on, or from the first."""
+    step = torch.arange(actions.shape[1])
+    since = step - (torch.zeros(len(actions), 1) if begin is None else begin.unsqueeze(-1))  # [n, T]
+    moving = (since >= 0) & (since < MOVED_IN)
     moved = actions.clone()
-    count = min(MOVED_IN, actions.shape[1])
-    moved[:, :count, :3] += shifts.unsqueeze(1) / (count * keys.POSITION_STEP)
+    moved[..., :3] += moving.unsqueeze(-1) * shifts.unsqueeze(1) / (MOVED_IN * keys.POSITION_STEP)
     return moved.clamp(-1, 1)
 
 
@@ -133,7 +139,9 @@ def _drawn(found: TensorDictBase, settings: Explore, drawn: torch.Generator) -> 
         return
     chosen = found[torch.randint(len(found), (count,), generator=drawn)].clone()
     far = settings.replay_shift_m * torch.rand(count, 1, generator=drawn)
-    chosen["actions"] = moved_aside(chosen["actions"], far * directions(count, drawn))
+    late = torch.rand(count, generator=drawn) < _LATE
+    begin = late * (torch.rand(count, generator=drawn) * chosen["reached"]).long()
+    chosen["actions"] = moved_aside(chosen["actions"], far * directions(count, drawn), begin)
     waves = -(-count // settings.num_envs)
     yield from chosen.split(-(-count // waves))
 

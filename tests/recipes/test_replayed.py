@@ -91,7 +91,8 @@ def test_where_nothing_is_moved_the_same_happens_again(run, demonstrated):
             assert torch.equal(rollout[name][:steps], source[name][:steps])
 
 
-def test_the_hand_is_moved_and_stays_beside_the_path(run, demonstrated):
+def test_the_hand_is_moved_and_stays_beside_the_path(run, demonstrated, monkeypatch):
+    monkeypatch.setattr(replayed, "_LATE", 0.0)
     explore(run)
     moved, contexts = replays(run), demonstrated[keys.CONTEXT_ID][:, 0, 0].tolist()
     here, source = paths(moved), paths(demonstrated)
@@ -136,6 +137,28 @@ def test_actions_move_the_hand_by_what_is_asked():
     assert full.max() == 1  # an action goes no further
 
 
+def test_it_may_begin_on_the_way(run, demonstrated, monkeypatch):
+    monkeypatch.setattr(replayed, "_LATE", 1.0)
+    explore(run)
+    moved, contexts = replays(run), demonstrated[keys.CONTEXT_ID][:, 0, 0].tolist()
+    begun = []
+    for rollout in moved:
+        source = demonstrated[contexts.index(int(rollout[keys.CONTEXT_ID][0, 0]))]
+        steps = int(source[keys.MASK].sum())  # the last one reaches the goal
+        differs = (rollout[keys.ACTION][:steps] != source[keys.ACTION][:steps]).any(-1)
+        begun.append(int(differs.long().argmax()) if differs.any() else steps)
+        assert not differs[begun[-1] + MOVED_IN :].any()
+        assert not (rollout[keys.ACTION][:steps] != source[keys.ACTION][:steps])[:, 3:].any()
+    assert len(set(begun)) > 3 and max(begun) > MOVED_IN
+
+
+def test_actions_are_moved_from_where_it_begins():
+    moved = moved_aside(torch.zeros(2, 30, 7), torch.full((2, 3), 0.06), torch.tensor([0, 15]))
+    assert moved[0].any(-1).nonzero().squeeze(-1).tolist() == list(range(MOVED_IN))
+    assert moved[1].any(-1).nonzero().squeeze(-1).tolist() == list(range(15, 15 + MOVED_IN))
+    assert torch.allclose(keys.POSITION_STEP * moved.sum(1)[:, :3], torch.full((2, 3), 0.06))
+
+
 def test_without_a_success_nothing_is_played_again(run):
     explore(run)
     own = waves_per_scale(run.config.explore, len(TASKS)) * run.config.explore.num_envs
@@ -178,5 +201,11 @@ def test_as_far_in_every_direction():
 
 def _still():
     return TensorDict(
-        {"actions": torch.zeros(20, 7), keys.CONTEXT_ID: torch.tensor(0), keys.TASK_ID: torch.tensor(0)}, []
+        {
+            "actions": torch.zeros(20, 7),
+            keys.CONTEXT_ID: torch.tensor(0),
+            keys.TASK_ID: torch.tensor(0),
+            "reached": torch.tensor(8),
+        },
+        [],
     )
