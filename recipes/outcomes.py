@@ -18,14 +18,13 @@ from collecting import of_worker
 from config import WorldEnvConfig
 from imagination import Imagination
 from parts import PROPRIO
-from physics import tabletop
+from physics import starting_at, tabletop
 from run import Run
 from worldenv_trl import keys
 from worldenv_trl.envs import Reflect, chunked, context_id
 from worldenv_trl.policies import DeviceBridge
 from worldenv_trl.record import RolloutWriter
 from worldenv_trl.reflectors import Reflector, StopRule
-from worldenv_trl.scenes import load_task
 
 
 @dataclass(frozen=True)
@@ -57,12 +56,8 @@ def physics_outcomes(
     """
     options: dict[str, Any] = {"init_state_count": episodes, "proprio": proprio}
     if indices is not None:  # these initial states of the split only
-        task_id, episodes = run.config.tasks.index(task), len(indices)
-        options = {
-            "proprio": proprio,
-            "init_states": load_task(task).init_states(split, max(indices) + 1)[list(indices)],
-            "context_ids": [context_id(task_id, split, index) for index in indices],
-        }
+        episodes = len(indices)
+        options = {"proprio": proprio} | starting_at(run.config, split, task, indices)
     num_envs = min(run.config.evaluate.num_envs, episodes)
     options["with_sim_state"] = writer is not None
     env = outcomes_env(run.config, task, split, judge, num_envs, **options)

@@ -12,9 +12,10 @@ from torchrl.modules import MultiStepActorWrapper
 from config import WorldEnvConfig
 from parts import PROPRIO
 from seeds import stage_seed
-from worldenv_trl.envs import TabletopEnv, chunked
+from worldenv_trl.envs import TabletopEnv, chunked, context_id
 from worldenv_trl.policies import AutoregressiveActor, DeviceBridge, LaplaceActor, Policy, policy_actor, scale_bounds
 from worldenv_trl.record import provenance
+from worldenv_trl.scenes import load_task
 
 
 def tabletop(
@@ -49,6 +50,16 @@ def step_env(
 ) -> TransformedEnv:
     """Physics, one action a step (every frame is seen), with the ``is_init`` that :func:`chunk_player` needs."""
     return TransformedEnv(tabletop(config, split, num_envs, tasks, **options), InitTracker())
+
+
+def starting_at(config: WorldEnvConfig, split: str, task: str, indices: Sequence[int]) -> dict[str, Any]:
+    """Options of :func:`tabletop` whose rows start from these initial states of a split, in order."""
+    number = config.tasks.index(task)
+    return {
+        "init_states": load_task(task).init_states(split, max(indices) + 1)[list(indices)],
+        "context_ids": [context_id(number, split, index) for index in indices],
+        "init_state_mode": "cycle",
+    }
 
 
 def physics_waves_env(config: WorldEnvConfig, groups: int, group_size: int, **more: Any) -> EnvBase:

@@ -10,13 +10,12 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from physics import chunk_player, exploring_actor, recording, step_env
+from physics import chunk_player, exploring_actor, recording, starting_at, step_env
 from run import Run
 from seeds import stage_seed
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.data import Episodes, fill_store, open_store
-from worldenv_trl.envs import context_id
 from worldenv_trl.metrics import first_success
 from worldenv_trl.policies import Policy
 from worldenv_trl.record import RolloutWriter, read_metadata
@@ -152,12 +151,10 @@ def _live(run: Run, policy: Policy, draw: Draw, path: Path) -> None:
                 "train",
                 len(wave) * draw.group_size,
                 [task],
-                init_states=load_task(task).init_states("train", max(wave) + 1)[wave],
-                context_ids=[context_id(config.tasks.index(task), "train", index) for index in wave],
-                init_state_mode="cycle",
                 group_repeats=draw.group_size,
                 terminate_on_success=False,
                 with_sim_state=True,
+                **starting_at(config, "train", task, wave),
             )
             if writer is None:
                 about = recording(config, env, "groups", {"policy": policy}, draw=asdict(draw))

@@ -17,12 +17,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import MultiStepActorWrapper
 
-from physics import chunk_player, exploring_actor, step_env
+from physics import chunk_player, exploring_actor, starting_at, step_env
 from resumable import Outside, Resumable
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import context_id
-from worldenv_trl.scenes import load_task
 
 if TYPE_CHECKING:
     from config import Explore
@@ -77,7 +76,7 @@ def directions(count: int, drawn: torch.Generator) -> Tensor:
 
 def moved_aside(actions: Tensor, shifts: Tensor, begin: Tensor | None = None) -> Tensor:
     """Actions [n, T, 7] that take the hand to the same path moved by ``shifts`` [n, 3] (m), and along it, from the step
-    ``begin`` int64 [n] on, or from the first."""
+    ``begin`` int64 [n] on, or from the first; less far where an action would exceed [-1, 1]."""
     step = torch.arange(actions.shape[1])
     since = step - (torch.zeros(len(actions), 1) if begin is None else begin.unsqueeze(-1))  # [n, T]
     moving = (since >= 0) & (since < MOVED_IN)
@@ -87,7 +86,7 @@ def moved_aside(actions: Tensor, shifts: Tensor, begin: Tensor | None = None) ->
 
 
 def play_again(run: Run, policy: Policy, successes: Successes, recorded: ResumableRecording, target: str) -> None:
-    """Plays successes drawn of every task again, each moved by up to ``replay_shift_m``, and records them.
+    """Plays successes drawn of every task again, each moved by up to ``replay_shift_m``, records and logs them.
 
     The recording shows what was done as ``action``, and beside it what ``policy`` would have done. A task without a
     success has nothing to be played again.
@@ -100,19 +99,16 @@ def play_again(run: Run, policy: Policy, successes: Successes, recorded: Resumab
     left = Resumable(run, "replays", len(waves), recording=Outside(recorded), reached=reached)
     for index in left.bar(f"{target} moved aside", "wave"):
         wave = waves[index]
-        name = config.tasks[int(wave[keys.TASK_ID][0])]
-        contexts = wave[keys.CONTEXT_ID].tolist()
-        starts = [each - context_id(config.tasks.index(name), "train", 0) for each in contexts]
+        number = int(wave[keys.TASK_ID][0])
+        name, starts = config.tasks[number], wave[keys.CONTEXT_ID] - context_id(number, "train", 0)
         env = step_env(
             config,
             "train",
             len(wave),
             [name],
-            init_states=load_task(name).init_states("train", max(starts) + 1)[starts],
-            context_ids=contexts,
-            init_state_mode="cycle",
             terminate_on_success=False,
             with_sim_state=True,
+            **starting_at(config, "train", name, starts.tolist()),
         )
         collector = GroupCollector(
             env,

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType
 
-from physics import chunk_player, step_env, tabletop
+from physics import chunk_player, starting_at, step_env, tabletop
 from run import Run
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
@@ -18,7 +18,6 @@ from worldenv_trl.data import Episodes, episodes_from_rollouts, imagine_episodes
 from worldenv_trl.envs import context_id
 from worldenv_trl.metrics import first_success, honesty, judged
 from worldenv_trl.reflectors import Reflector, StopRule
-from worldenv_trl.scenes import load_task
 from worldenv_trl.world_models import WorldModel
 
 
@@ -93,7 +92,6 @@ def relive(run: Run, imagined: Episodes | TensorDictBase, split: str = "train") 
     context, length = imagined[keys.CONTEXT_ID].squeeze(-1), imagined["length"]
     success = torch.zeros(*imagined["actions"].shape[:2], dtype=torch.bool)
     for number, name in enumerate(config.tasks):
-        task = load_task(name)
         rows = (imagined[keys.TASK_ID].squeeze(-1) == number).nonzero().squeeze(-1)
         if not len(rows):
             continue
@@ -105,9 +103,7 @@ def relive(run: Run, imagined: Episodes | TensorDictBase, split: str = "train") 
             [name],
             cameras=(),
             terminate_on_success=False,
-            init_states=task.init_states(split, int(index.max()) + 1)[index.tolist()],
-            context_ids=context[rows].tolist(),
-            init_state_mode="cycle",
+            **starting_at(config, split, name, index.tolist()),
         )
         state = env.reset()
         for step in range(imagined["actions"].shape[1]):
