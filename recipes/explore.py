@@ -26,7 +26,8 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
     config, folder, settings = run.config, run.folder, run.config.explore
     run.seed_everything(target)
     model = run.policy(policy).eval()
-    waves, successes = waves_per_scale(settings, len(config.tasks)), Successes(config.max_steps)
+    waves = waves_per_scale(settings, len(config.tasks))
+    successes = Successes(config.max_steps) if replays_per_task(settings) else None
     # After success the rollout goes on: the models must see what undoes it (World-Env Figure 6).
     options: dict[str, Any] = {
         "terminate_on_success": False,
@@ -66,7 +67,8 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
             for _ in left.bar(f"{target} scale x{factor:g}", "wave"):
                 rollouts = next(collected)[:, 0]
                 recorded.writer.write(rollouts)
-                successes.note(rollouts)
+                if successes is not None:
+                    successes.note(rollouts)
                 reached.append(
                     (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1).float().mean().item()
                 )
@@ -74,7 +76,8 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
             folder.log(
                 target, scale_factor=factor, episodes=waves * settings.num_envs, success=sum(reached) / len(reached)
             )
-        play_again(run, model, successes, recorded, target)
+        if successes is not None:
+            play_again(run, model, successes, recorded, target)
     env.close()
 
 
@@ -82,6 +85,11 @@ def waves_per_scale(settings: Explore, tasks: int) -> int:
     """Of ``num_envs`` rollouts; what is played again comes on top."""
     episodes = (settings.episodes_per_task - replays_per_task(settings)) * tasks
     return -(-episodes // (len(settings.scale_factors) * settings.num_envs))
+
+
+def own_episodes(settings: Explore, tasks: int) -> int:
+    """Of a round, without those that are played again: they come first in its recording."""
+    return waves_per_scale(settings, tasks) * len(settings.scale_factors) * settings.num_envs
 
 
 if __name__ == "__main__":

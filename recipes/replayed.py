@@ -130,9 +130,9 @@ def play_again(run: Run, policy: Policy, successes: Successes, recorded: Resumab
 
 def _drawn(found: TensorDictBase, settings: Explore, drawn: torch.Generator) -> Iterator[TensorDictBase]:
     """Waves of a task's successes to be played again, with the actions that move them."""
-    count = replays_per_task(settings)
-    if not count or not len(found):
+    if not len(found):
         return
+    count = replays_per_task(settings)
     chosen = found[torch.randint(len(found), (count,), generator=drawn)].clone()
     far = settings.replay_shift_m * torch.rand(count, 1, generator=drawn)
     late = torch.rand(count, generator=drawn) < _LATE

@@ -99,6 +99,11 @@ class RunFolder:
             raise FileNotFoundError(f"{path} does not exist: run the stage {stage!r} on this folder first")
         return path
 
+    def named_checkpoint(self, named: str, stage: str) -> Path:
+        """The checkpoint of that name, or the folder so named if the run has none; see :meth:`require_checkpoint`."""
+        path = Path(named)
+        return path if path.is_dir() and not self.checkpoint(named).is_dir() else self.require_checkpoint(named, stage)
+
     def require_rollouts(self, name: str, stage: str) -> Path:
         """Path of a rollout file that ``stage`` writes; raises ``FileNotFoundError`` naming the stage to run."""
         path = self.rollouts(name)

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from config import WorldEnvConfig
-from explore import waves_per_scale
+from explore import own_episodes
 from part_costs import Call, Size
 from probes import probed_iterations
 from rehearsal import Rehearsal
@@ -100,8 +100,7 @@ def decisions(config: WorldEnvConfig) -> int:
 def explored(config: WorldEnvConfig) -> int:
     """Episodes of a round of exploration, rounded up to whole waves."""
     settings, tasks = config.explore, len(config.tasks)
-    waves = waves_per_scale(settings, tasks) * len(settings.scale_factors)
-    return waves * settings.num_envs + replays_per_task(settings) * tasks
+    return own_episodes(settings, tasks) + replays_per_task(settings) * tasks
 
 
 def iteration_flops(config: WorldEnvConfig, found: Rehearsal) -> float:

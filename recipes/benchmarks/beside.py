@@ -2,8 +2,8 @@
 
 ``python recipes/benchmarks/beside.py runs/improve``. Explored rollouts that reached the goal, from initial states that
 the judge was not trained on, are played again with the hand moved by so many centimetres, in a direction drawn for
-each; what the physics makes of it is held against R at the end of the same path. Noise moves a hand to and
-fro, what LOOP does to a policy moves it to one side: where R does not fall as success does, LOOP is led astray.
+each; what the physics makes of it is held against R at the end of the same path. Noise moves a hand to and fro, what
+LOOP does to a policy moves it to one side: where R does not fall as success does, LOOP is led astray.
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ from typing import Any
 
 import torch
 import tyro
-from tensordict import TensorDict
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from command_line import at_least, refusals
 from episodes import demonstrations_and_exploration, split_by_context
-from explore import waves_per_scale
+from explore import own_episodes
 from gather_evidence import read_config
 from replayed import directions, moved_aside
 from run import Run
@@ -33,6 +32,7 @@ from two_worlds import relive
 from worldenv_trl import keys
 from worldenv_trl.data import Episodes, score_episodes
 from worldenv_trl.metrics import wilson_interval
+from worldenv_trl.reflectors import Reflector
 from worldenv_trl.report import RunRecord
 
 
@@ -61,14 +61,10 @@ def main(settings: Settings) -> Path:
         use_threads(settings.num_threads)
         config = read_config(RunRecord.read(settings.run), settings.num_threads, "cpu")
         run = Run(config, RunFolder(settings.run))
-        path = Path(settings.reflector)
-        if run.folder.checkpoint(settings.reflector).is_dir() or not path.is_dir():
-            path = run.folder.require_checkpoint(settings.reflector, "train_reflector")
+        path = run.folder.named_checkpoint(settings.reflector, "train_reflector")
         judge = run.parts.reflector.load(path).eval().for_world("imagined")
         if judge.reads_video:
-            raise ValueError(
-                f"the judge in {path} looks at videos, and nobody has seen these paths: train one of paths"
-            )
+            raise ValueError(f"the judge in {path} looks at videos, of which there are none here: it must read paths")
         successes = kept_out_successes(run, settings.episodes_per_task)
         figures = measure(run, judge, successes, settings)
     out = settings.out or settings.run / f"beside_{path.name}.json"
@@ -86,10 +82,8 @@ def kept_out_successes(run: Run, per_task: int) -> Episodes:
     """
     config = run.config
     _, explored = demonstrations_and_exploration(run, 1)
-    own = (
-        waves_per_scale(config.explore, len(config.tasks)) * config.explore.num_envs * len(config.explore.scale_factors)
-    )
-    _, kept_out = split_by_context(explored[:own], config.reflector.holdout, run.seed("held-out contexts"))
+    explored = explored[: own_episodes(config.explore, len(config.tasks))]
+    _, kept_out = split_by_context(explored, config.reflector.holdout, run.seed("held-out contexts"))
     task, reached = kept_out[keys.TASK_ID].squeeze(-1), kept_out["success"].any(-1)
     rows = [((task == number) & reached).nonzero().squeeze(-1)[:per_task] for number in range(len(config.tasks))]
     if not sum(map(len, rows)):
@@ -97,7 +91,7 @@ def kept_out_successes(run: Run, per_task: int) -> Episodes:
     return kept_out[torch.cat(rows)]
 
 
-def measure(run: Run, judge: Any, successes: Episodes, settings: Settings) -> dict[str, Any]:
+def measure(run: Run, judge: Reflector, successes: Episodes, settings: Settings) -> dict[str, Any]:
     """For each task, and all: number of paths, and at each distance successes and the mean of R."""
     drawn = torch.Generator().manual_seed(settings.seed)
     task, first = successes[keys.TASK_ID].squeeze(-1), successes["kinematic_states"][:, 0]
@@ -109,18 +103,13 @@ def measure(run: Run, judge: Any, successes: Episodes, settings: Settings) -> di
         episodes = successes[:]
         after = run.kinematics.rollout(first, moved)
         episodes["actions"], episodes["kinematic_states"] = moved, torch.cat([first.unsqueeze(1), after], 1)
-        reached = relive(run, _entries(episodes)).any(-1)
+        reached = relive(run, episodes).any(-1)
         scores = score_episodes(judge, episodes)[:, -1]
         for name, chosen in rows.items():
             if chosen.any():
                 figures = {"successes": int(reached[chosen].sum()), "R": scores[chosen].mean().item()}
                 out[name]["at"][f"{distance:g}"] = figures | _by_outcome(scores[chosen], reached[chosen])
     return out
-
-
-def _entries(episodes: Episodes) -> TensorDict:
-    names = ("actions", "length", keys.CONTEXT_ID, keys.TASK_ID)
-    return TensorDict({name: episodes[name] for name in names}, batch_size=[len(episodes)])
 
 
 def _by_outcome(scores: Tensor, reached: Tensor) -> dict[str, float | None]:
@@ -132,12 +121,8 @@ def _by_outcome(scores: Tensor, reached: Tensor) -> dict[str, float | None]:
 def table(figures: dict[str, Any]) -> str:
     """Success in the physics and mean R at each distance."""
     distances = list(figures["all"]["at"])
-    lines = [
-        "| paths that succeed, the hand moved by | "
-        + " | ".join(f"{100 * float(each):g} cm" for each in distances)
-        + " |",
-        "|---" * (len(distances) + 1) + "|",
-    ]
+    moved = " | ".join(f"{100 * float(each):g} cm" for each in distances)
+    lines = [f"| paths that succeed, the hand moved by | {moved} |", "|---" * (len(distances) + 1) + "|"]
     for name, found in figures.items():
         count, cells = found["paths"], found["at"].values()
         if count:

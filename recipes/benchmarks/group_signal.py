@@ -104,9 +104,9 @@ def main(settings: Settings) -> Path:
         draw = Draw(settings.contexts, settings.group_size, factor, settings.seed)
         check_draw(run, draw)
         paths = {
-            "policy": checkpoint(run, settings.policy, "sft"),
-            "world_model": checkpoint(run, settings.world_model, "train_world_model"),
-            "reflector": checkpoint(run, settings.reflector, "train_reflector"),
+            "policy": run.folder.named_checkpoint(settings.policy, "sft"),
+            "world_model": run.folder.named_checkpoint(settings.world_model, "train_world_model"),
+            "reflector": run.folder.named_checkpoint(settings.reflector, "train_reflector"),
         }
         policy = run.parts.policy.load(paths["policy"]).to(run.device)
         world_model = run.parts.world_model.load(paths["world_model"]).eval().to(run.device)
@@ -138,20 +138,6 @@ def main(settings: Settings) -> Path:
     print(markdown(report))
     print(f"\n{out}: all figures; measured in {report['seconds']:.0f} s")
     return out
-
-
-def checkpoint(run: Run, named: str, stage: str) -> Path:
-    """The folder of a checkpoint of the run or, if it has none of that name, the folder so named.
-
-    Raises:
-        FileNotFoundError: if there is neither.
-    """
-    path = Path(named)
-    return (
-        path
-        if path.is_dir() and not run.folder.checkpoint(named).is_dir()
-        else run.folder.require_checkpoint(named, stage)
-    )
 
 
 def read_report(path: Path) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import config
 import explore as explore_stage
 import replayed
 from demonstrate import demonstrate
-from explore import explore, waves_per_scale
+from explore import explore, own_episodes, waves_per_scale
 from parts import COMPACT
 from replayed import MOVED_IN, Successes, moved_aside, replays_per_task
 from stage_plan import explored
@@ -67,7 +67,7 @@ def with_shift(run, shift: float):
 
 def replays(run):
     """The rollouts behind the policy's own."""
-    own = waves_per_scale(run.config.explore, len(TASKS)) * run.config.explore.num_envs
+    own = own_episodes(run.config.explore, len(TASKS))
     every = read_rollouts(run.folder.rollouts("explore"))
     assert len(every) == explored(run.config) == own + 2 * 4
     return every[own:]
@@ -161,7 +161,7 @@ def test_actions_are_moved_from_where_it_begins():
 
 def test_without_a_success_nothing_is_played_again(run):
     explore(run)
-    own = waves_per_scale(run.config.explore, len(TASKS)) * run.config.explore.num_envs
+    own = own_episodes(run.config.explore, len(TASKS))
     assert len(read_rollouts(run.folder.rollouts("explore"))) == own
 
 
