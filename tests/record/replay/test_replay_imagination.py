@@ -256,6 +256,26 @@ def test_the_reflector_stops_where_it_did_and_another_threshold_stops_elsewhere(
     assert late.outcome["replayed"]["last step"] == 9
 
 
+class OfTwo(Redness):
+    """Another one judges imagination."""
+
+    def __init__(self) -> None:
+        super().__init__(cameras=("agentview",))
+        self.factor, self.imagined = 0.0, Redness(cameras=("agentview",))
+        self.imagined.weight = torch.nn.Parameter(torch.ones(1))  # told apart by its hash
+
+    def for_world(self, world: str) -> Reflector:
+        return self.imagined if world == "imagined" else self
+
+
+@pytest.mark.parametrize("recorded", ["imagined", "all"])
+def test_imagination_is_judged_by_the_one_that_judged_it(tmp_path, recorded):
+    model, judge = Painter(), OfTwo()
+    imagine(tmp_path / "a.mcap", model, reflector=judge.imagined if recorded == "imagined" else judge)
+    same = replay(tmp_path / "a.mcap", 0, world_model=model, reflector=judge, write=False)
+    assert same.exact is True and "success_prob" in same.compared and not same.notes
+
+
 def test_an_edit_is_told_apart_from_another_model(tmp_path):
     imagine(tmp_path / "a.mcap", Painter())
     other = Painter(tint=7)

@@ -116,6 +116,7 @@ def replay(
 
     notes: list[str] = []
     recorded = observed(source.entries)
+    reflector = None if reflector is None else _judge(source, reflector, mode)
     rule = _rule(source, reflector)
     unchanged = None
     with torch.random.fork_rng(devices=[]):  # a branch seeds the policy's samples
@@ -274,6 +275,13 @@ def _rule(source: Source, reflector: Reflector | None) -> StopRule | None:
     described = next((text for text in source.env.get("transforms", []) if text.startswith("Reflect(")), "")
     found = dict(_RULE.findall(described))
     return StopRule(float(found.get("threshold", StopRule.threshold)), int(found.get("consecutive", 1)))
+
+
+def _judge(source: Source, reflector: Reflector, mode: str) -> Reflector:
+    """The one of ``reflector`` that judges there (``for_world``), unless all of it was recorded as the judge."""
+    if source.models.get("reflector") == model_hash(reflector):
+        return reflector
+    return reflector.for_world("imagined" if mode == "imagination" else "real")
 
 
 def _same_versions(source: Source, notes: list[str]) -> bool:
