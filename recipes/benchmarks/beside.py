@@ -98,8 +98,9 @@ def measure(run: Run, judge: Reflector, successes: Episodes, settings: Settings)
     rows = {"all": torch.ones_like(task, dtype=torch.bool)}
     rows |= {name: task == number for number, name in enumerate(run.config.tasks)}
     out: dict[str, Any] = {name: {"paths": int(chosen.sum()), "at": {}} for name, chosen in rows.items()}
+    towards = directions(len(successes), drawn)
     for distance in settings.distances:
-        moved = moved_aside(successes["actions"], distance * directions(len(successes), drawn))
+        moved = moved_aside(successes["actions"], distance * towards)
         episodes = successes[:]
         after = run.kinematics.rollout(first, moved)
         episodes["actions"], episodes["kinematic_states"] = moved, torch.cat([first.unsqueeze(1), after], 1)
