@@ -9,6 +9,7 @@ from libero_files import check_files, from_libero
 from loggers import check_loggers
 from parts import COMPACT, Parts
 from physics import tabletop
+from replayed import replays_per_task
 from worldenv_trl.data import ACTIONS
 from worldenv_trl.devices import choose_device
 from worldenv_trl.policies import Policy, TokenPolicy
@@ -152,6 +153,11 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         )
     if not 0 <= config.explore.replay_share < 1:
         raise ValueError(f"explore.replay_share must lie in [0, 1), got {config.explore.replay_share}")
+    if replays_per_task(config.explore) >= config.explore.episodes_per_task:
+        raise ValueError(
+            f"explore.replay_share {config.explore.replay_share} of {config.explore.episodes_per_task} episodes a task "
+            "leaves none of the policy's own to be played again: lower it"
+        )
     if not 0 <= config.explore.replay_shift_m <= _FARTHEST_REPLAY_M:
         raise ValueError(
             f"explore.replay_shift_m must lie between 0 and {_FARTHEST_REPLAY_M} (m), got "

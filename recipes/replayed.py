@@ -7,6 +7,7 @@ it comes to is seen here, and labelled by the physics.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -89,11 +90,20 @@ def play_again(run: Run, policy: Policy, successes: Successes, recorded: Resumab
     """Plays successes drawn of every task again, each moved by up to ``replay_shift_m``, records and logs them.
 
     The recording shows what was done as ``action``, and beside it what ``policy`` would have done. A task without a
-    success has nothing to be played again.
+    success has nothing to be played again: a warning says so.
     """
     config, settings = run.config, run.config.explore
     drawn = torch.Generator().manual_seed(run.seed(target, "replays"))
-    waves = [wave for number in range(len(config.tasks)) for wave in _drawn(successes.of_task(number), settings, drawn)]
+    waves: list[TensorDictBase] = []
+    for number, name in enumerate(config.tasks):
+        found = successes.of_task(number)
+        waves += _drawn(found, settings, drawn)
+        if not len(found):
+            warnings.warn(
+                f"no explored rollout of {name} reached the goal: none is played again, {replays_per_task(settings)} "
+                "episodes fewer are explored",
+                stacklevel=2,
+            )
     player = chunk_player(exploring_actor(config, policy, 1e-6), config.chunk_length)
     reached: list[float] = []
     left = Resumable(run, "replays", len(waves), recording=Outside(recorded), reached=reached)

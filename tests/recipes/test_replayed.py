@@ -160,7 +160,10 @@ def test_actions_are_moved_from_where_it_begins():
 
 
 def test_without_a_success_nothing_is_played_again(run):
-    explore(run)
+    with pytest.warns(
+        UserWarning, match=f"no explored rollout of {TASKS[0]} reached the goal: none is played again, 4"
+    ):
+        explore(run)
     own = own_episodes(run.config.explore, len(TASKS))
     assert len(read_rollouts(run.folder.rollouts("explore"))) == own
 

@@ -60,6 +60,7 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"demonstrate": Demonstrate(episodes_per_task=0)}, "demonstrate.episodes_per_task must be at least 1"),
         ({"explore": Explore(scale_factors=())}, "explore.scale_factors"),
         ({"explore": Explore(replay_share=1.0)}, "explore.replay_share must lie in"),
+        ({"explore": Explore(replay_share=0.999)}, "explore.replay_share 0.999 of 160 episodes a task leaves none"),
         ({"explore": Explore(replay_shift_m=0.5)}, "explore.replay_shift_m must lie between 0 and 0.2"),
         (
             {"post_train": PostTrain(ratio_level="token")},
