@@ -9,16 +9,13 @@ from libero_files import check_files, from_libero
 from loggers import check_loggers
 from parts import COMPACT, Parts
 from physics import tabletop
+from ranges import check_ranges
 from replayed import replays_per_task
 from worldenv_trl.data import ACTIONS
 from worldenv_trl.devices import choose_device
 from worldenv_trl.policies import Policy, TokenPolicy
 from worldenv_trl.reflectors import StopRule
 from worldenv_trl.scenes import load_task
-
-_FARTHEST_SHIFT_M = 0.2
-_FARTHEST_REPLAY_M = 0.2
-_FARTHEST_PLACE_M = 0.035  # of the radii that policies.PlaceShift has by default
 
 
 def check_shares(config: WorldEnvConfig, processes: int) -> None:
@@ -84,117 +81,42 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             f"sft.cameras must be of the run's cameras, {', '.join(config.cameras)}, got {', '.join(unseen)}: "
             "add them to cameras"
         )
-    counts = (
-        ("num_threads", config.num_threads),
-        ("rounds", config.rounds),
-        ("train_states", config.train_states),
-        ("chunk_length", config.chunk_length),
-        ("demonstrate.episodes_per_task", config.demonstrate.episodes_per_task),
-        ("explore.episodes_per_task", config.explore.episodes_per_task),
-        ("explore.num_envs", config.explore.num_envs),
-        ("sft.steps", config.sft.steps),
-        ("sft.batch_size", config.sft.batch_size),
-        ("world_model.steps", config.world_model.steps),
-        ("world_model.refit_steps", config.world_model.refit_steps),
-        ("world_model.batch_size", config.world_model.batch_size),
-        ("post_train.iterations", config.post_train.iterations),
-        ("post_train.groups", config.post_train.groups),
-        ("post_train.epochs", config.post_train.epochs),
-        ("post_train.minibatch_size", config.post_train.minibatch_size),
-        ("post_train.probe_contexts", config.post_train.probe_contexts),
-        ("evaluate.episodes_per_task", config.evaluate.episodes_per_task),
-        ("evaluate.num_envs", config.evaluate.num_envs),
-    )
-    for name, count in counts:
-        if count < 1:
-            raise ValueError(f"{name} must be at least 1, got {count}")
+    check_ranges(config)
     wanted = config.demonstrate.episodes_per_task
     if config.demonstrate.states == "spread" and wanted > config.train_states and not from_libero(config):
         raise ValueError(
             f"demonstrate.episodes_per_task must be at most {config.train_states}, train_states, where the states are "
             f"spread, got {wanted}"
         )
-    if config.seed < 0:
-        raise ValueError(f"seed must be a whole number of at least 0, got {config.seed}")
-    if not 0 <= config.sft.scene_shift_m <= _FARTHEST_SHIFT_M:
+    if not 0 <= config.sft.shift_px < config.image_size:
         raise ValueError(
-            f"sft.scene_shift_m must lie between 0 and {_FARTHEST_SHIFT_M} (m), got {config.sft.scene_shift_m}: moved "
-            "further, what rises above the table is shown wrongly"
+            f"sft.shift_px must be at least 0 and less than image_size, {config.image_size}, got {config.sft.shift_px}"
         )
-    if not 0 <= config.sft.place_shift_m <= _FARTHEST_PLACE_M:
-        raise ValueError(
-            f"sft.place_shift_m must lie between 0 and {_FARTHEST_PLACE_M} (m), got {config.sft.place_shift_m}: moved "
-            "further, what is around folds over itself"
-        )
-    if not 0 <= config.sft.decision_share <= 1:
-        raise ValueError(f"sft.decision_share must lie between 0 and 1, got {config.sft.decision_share}")
-    if not 0 <= config.sft.aim_weight < float("inf"):
-        raise ValueError(f"sft.aim_weight must be at least 0, got {config.sft.aim_weight}")
     if config.sft.aim_weight and config.sft.shift_px:
         raise ValueError(
             f"sft.aim_weight needs sft.shift_px 0, got {config.sft.shift_px}: the random shift moves the image and not "
             "the place that is aimed at; sft.scene_shift_m moves both"
         )
-    if config.reflector.path_steps < 0:
-        raise ValueError(f"reflector.path_steps must be at least 0, got {config.reflector.path_steps}")
-    if not 0 <= config.checkpoint_minutes < float("inf"):
-        raise ValueError(f"checkpoint_minutes must be at least 0, got {config.checkpoint_minutes}")
-    if config.post_train.group_size < 2:
-        raise ValueError(f"post_train.group_size must be at least 2, got {config.post_train.group_size}")
     for name, rows, dealt in (
         ("explore.num_envs", config.explore.num_envs, True),
         ("post_train.groups", config.post_train.groups, config.post_train.env == "tabletop"),
     ):
         if dealt and rows < len(config.tasks):
             raise ValueError(f"{name} must be at least {len(config.tasks)}, one for each task, got {rows}")
-    if not config.explore.scale_factors or min(config.explore.scale_factors) < 0:
-        raise ValueError(
-            f"explore.scale_factors must be one number or more, none negative, got {config.explore.scale_factors}"
-        )
-    if not 0 <= config.explore.replay_share < 1:
-        raise ValueError(f"explore.replay_share must lie in [0, 1), got {config.explore.replay_share}")
+    if not config.explore.scale_factors:
+        raise ValueError("explore.scale_factors is empty: name at least one, for instance 1")
     if replays_per_task(config.explore) >= config.explore.episodes_per_task:
         raise ValueError(
             f"explore.replay_share {config.explore.replay_share} of {config.explore.episodes_per_task} episodes a task "
             "leaves none of the policy's own to be played again: lower it"
         )
-    if not 0 <= config.explore.replay_shift_m <= _FARTHEST_REPLAY_M:
-        raise ValueError(
-            f"explore.replay_shift_m must lie between 0 and {_FARTHEST_REPLAY_M} (m), got "
-            f"{config.explore.replay_shift_m}: farther, a hand leaves the table"
-        )
-    for name, share in (
-        ("world_model.failure_share", config.world_model.failure_share),
-        ("world_model.holdout", config.world_model.holdout),
-        ("reflector.imagined_share", config.reflector.imagined_share),
-        ("reflector.holdout", config.reflector.holdout),
-        ("post_train.averaging", config.post_train.averaging),
-        ("post_train.source_share", config.post_train.source_share),
-    ):
-        if share is not None and not 0 <= share <= 1:
-            raise ValueError(f"{name} must lie between 0 and 1, got {share}")
-    if not 0 <= config.post_train.momentum < 1:
-        raise ValueError(f"post_train.momentum must be at least 0 and below 1, got {config.post_train.momentum}")
-    if min(config.post_train.lora_lr, config.post_train.head_lr) < 0 or not config.post_train.head_lr:
-        raise ValueError(
-            "post_train.head_lr must be positive and post_train.lora_lr at least 0, got "
-            f"{config.post_train.head_lr} and {config.post_train.lora_lr}"
-        )
-    if not 0 < config.post_train.false_alarm_rate < 1:
-        raise ValueError(
-            f"post_train.false_alarm_rate must lie between 0 and 1, got {config.post_train.false_alarm_rate}"
-        )
     try:
         StopRule(config.reflector.threshold, config.reflector.consecutive)
     except ValueError as error:
         raise ValueError(f"reflector.{error}") from error
-    if not all(floor > 0 for floor in config.scale_floor):
-        raise ValueError(f"scale_floor must be positive, got {config.scale_floor}")
-    if not 0 <= config.scale_share <= 1:
-        raise ValueError(f"scale_share must lie between 0 and 1, got {config.scale_share}")
     if config.image_size < 32 or config.image_size % 16:
         raise ValueError(f"image_size must be a multiple of 16 px and at least 32, got {config.image_size}")
-    if config.max_steps < 1 or config.max_steps % config.chunk_length:
+    if config.max_steps % config.chunk_length:
         raise ValueError(f"max_steps must be a multiple of chunk_length={config.chunk_length}, got {config.max_steps}")
     check_loggers(config.logger)
     check_collectors(config)

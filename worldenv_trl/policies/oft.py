@@ -81,8 +81,8 @@ class OFTConfig:
             raise ValueError(
                 f"stem_widths needs two entries and depth one at least, got {self.stem_widths}, {self.depth}"
             )
-        if self.dim % self.num_heads:
-            raise ValueError(f"dim must be a multiple of num_heads={self.num_heads}, got {self.dim}")
+        if self.dim < 1 or self.num_heads < 1 or self.dim % self.num_heads:
+            raise ValueError(f"dim must be a positive multiple of num_heads={self.num_heads}, got {self.dim}")
         if not self.vocabulary:
             object.__setattr__(self, "vocabulary", Vocabulary.of(self.instructions))
 

@@ -79,6 +79,8 @@ class VideoWorldModelConfig:
             object.__setattr__(self, name, tuple(int(value) for value in getattr(self, name)))
         if len(self.multipliers) != len(self.blocks) or not self.blocks:
             raise ValueError(f"multipliers and blocks must be equally long, got {self.multipliers} and {self.blocks}")
+        if self.patch < 1:
+            raise ValueError(f"patch must be at least 1 px, got {self.patch}")
         grid = self.patch * 2 ** (len(self.blocks) - 1)
         if self.image_size < 32 or self.image_size % max(16, grid):
             raise ValueError(
@@ -98,8 +100,8 @@ class VideoWorldModelConfig:
             raise ValueError(f"num_denoise_steps must lie between 1 and 4, got {self.num_denoise_steps}")
         if self.rows_per_call is not None and self.rows_per_call < 1:
             raise ValueError(f"rows_per_call must be at least 1, got {self.rows_per_call}")
-        if any(self.width * factor % 8 for factor in self.multipliers):
-            raise ValueError(f"width times every multiplier must be a multiple of 8, got {self.width}")
+        if any(self.width * factor < 8 or self.width * factor % 8 for factor in self.multipliers):
+            raise ValueError(f"width times every multiplier must be a positive multiple of 8, got {self.width}")
         for name, value in (("unroll_prob", self.unroll_prob), ("noise_prob", self.noise_prob)):
             if value is not None and not 0 <= value <= 1:
                 raise ValueError(f"{name} must lie between 0 and 1, got {value}")
