@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import random
+
 import torch
 
 import processes
@@ -34,13 +36,15 @@ def demonstrations_and_exploration(run: Run, rounds: int) -> tuple[Episodes, Epi
 
 
 def split_by_context(episodes: Episodes, share: float, seed: int) -> tuple[Episodes, Episodes]:
-    """Episodes for training, and those of a ``share`` of the initial states (at least one) for figures.
+    """Episodes for training, and those of about a ``share`` of the initial states for figures; at least one state each.
 
-    One ``seed`` for all rounds and both models: a later round must not show what an earlier one was trained on, and the
-    states of the smaller share are among those of the larger.
+    Whether a state is kept out is drawn for itself, from ``seed`` and its number alone. So with one seed for all rounds
+    and both models a later round, which may see other states, does not show what an earlier one was trained on, and the
+    states of a smaller share are among those of a larger.
     """
     contexts = episodes[keys.CONTEXT_ID].squeeze(-1)
-    distinct = contexts.unique()
-    order = torch.randperm(len(distinct), generator=torch.Generator().manual_seed(seed))
-    kept_out = torch.isin(contexts, distinct[order[: max(1, round(share * len(distinct)))]])
+    drawn = {number: random.Random(f"{seed} {number}").random() for number in contexts.unique().tolist()}
+    order = sorted(drawn, key=lambda number: drawn[number])
+    count = min(max(1, sum(value < share for value in drawn.values())), max(1, len(order) - 1))
+    kept_out = torch.isin(contexts, torch.tensor(order[:count]))
     return episodes[~kept_out], episodes[kept_out]
