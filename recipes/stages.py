@@ -20,7 +20,7 @@ from checks import check_config, check_shares
 from command_line import expected, in_options, refusals
 from config import PRESETS, WorldEnvConfig
 from libero_files import from_libero, with_files
-from parts import Parts
+from parts import Parts, check_made_of
 from real_parts import parts_of
 from run import Run
 from run_folder import RunFolder
@@ -140,6 +140,7 @@ def open_run(config: WorldEnvConfig, parts: Parts | None = None) -> Run:
 def _check_and_open(config: WorldEnvConfig, parts: Parts, folder: RunFolder, count: int) -> None:
     check_config(config, parts)
     check_shares(config, count)
+    check_made_of(folder.path / "checkpoints", parts)
     folder.open(config, {task: load_task(task).digest for task in config.tasks})
     folder.start_logging(config)
 

@@ -192,6 +192,15 @@ class Pretrained(_Module):
         return module.to(device)
 
 
+def saved_class(folder: str | os.PathLike) -> str | None:
+    """Name of the class whose ``save_pretrained`` wrote a checkpoint; None for a folder that does not say."""
+    try:
+        found = json.loads((Path(folder) / CONFIG_NAME).read_text())["class"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return found if isinstance(found, str) else None
+
+
 def _read_config(path: Path, class_name: str) -> tuple[dict, str | None]:
     try:
         config = json.loads(path.read_text())

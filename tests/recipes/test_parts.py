@@ -1,0 +1,48 @@
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from parts import COMPACT, Part
+from stages import open_run
+
+
+def left_by_another_run(tiny, name, text):
+    folder = tiny.run_dir / "checkpoints" / name
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("sft", "sft holds OtherPolicy, and the run's policy is OFTPolicy now: use another --run-dir"),
+        ("post_train_2", "the run's policy is OFTPolicy"),
+        ("world_model", "the run's world model is VideoWorldModel"),
+        ("reflector", "the run's reflector is CompactReflector or DualReflector"),
+    ],
+)
+def test_a_folder_of_other_parts_is_refused_and_left_as_it_was(tiny, name, message):
+    left_by_another_run(tiny, name, json.dumps({"class": "OtherPolicy", "config": {}}))
+    with pytest.raises(SystemExit, match=message):
+        open_run(tiny)
+    assert not (tiny.run_dir / "config.yaml").exists()
+
+
+def test_a_folder_of_the_same_parts_goes_on(tiny):
+    left_by_another_run(tiny, "sft", json.dumps({"class": "OFTPolicy"}))
+    left_by_another_run(tiny, "reflector", json.dumps({"class": "DualReflector"}))
+    left_by_another_run(tiny, "world_model", "not json")  # of a part that says nothing of itself
+    open_run(tiny).close()
+
+
+def test_what_a_loader_knows_is_not_guessed(tiny):
+    left_by_another_run(tiny, "sft", json.dumps({"class": "OtherPolicy"}))
+
+    def load(path: Path):
+        raise AssertionError("nothing is loaded")
+
+    swapped = Part(COMPACT.policy.make, load)
+    assert swapped.known == () and COMPACT.world_model.known == ("VideoWorldModel",)
+    open_run(tiny, dataclasses.replace(COMPACT, policy=swapped)).close()
