@@ -94,3 +94,18 @@ def test_goals_of_the_groups_reach_the_reflector(contexts):
 def test_a_reflector_of_a_camera_that_is_not_imagined_is_refused(contexts):
     with pytest.raises(ValueError, match=r"camera 'birdview' .* shows image, wrist_image\)"):
         imagined(contexts, FirstPixel(cameras=("birdview",)))
+
+
+class Shared(FirstPixel):
+    """Leaves imagination to another one."""
+
+    def for_world(self, world: str) -> FirstPixel:
+        return FirstPixel(cameras=self.cameras) if world == "imagined" else self
+
+
+def test_a_reflector_that_leaves_imagination_to_another_one_is_refused_there_alone(contexts):
+    judge = Shared(cameras=CAMERAS[:1])
+    with pytest.raises(ValueError, match="Shared leaves imagination to its FirstPixel: pass reflector"):
+        imagined(contexts, judge)
+    imagined(contexts, judge.for_world("imagined")).reset()
+    TransformedEnv(TabletopEnv(TASKS[0], 1, image_size=SIZE), Reflect(judge)).reset()

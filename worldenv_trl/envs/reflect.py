@@ -8,9 +8,11 @@ import torch
 from tensordict import NonTensorStack, TensorDict, TensorDictBase, is_leaf_nontensor, is_non_tensor
 from torch import Tensor
 from torchrl.data import Bounded, Composite
-from torchrl.envs.transforms import Transform
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Transform, TransformedEnv
 
 from worldenv_trl.devices import device_of
+from worldenv_trl.envs.imagined import ImaginedEnv
 from worldenv_trl.keys import (
     FRAMES,
     INSTRUCTION,
@@ -50,8 +52,9 @@ class Reflect(Transform):
         stops: False while scores are written and nothing is ended by them; frames in a row are then not counted.
 
     Raises:
-        ValueError: when it is put onto an env that does not show what the reflector looks at; when a reflector's state
-            or scores are not of the videos that it was given.
+        ValueError: when it is put onto an env that does not show what the reflector looks at, or onto imagination that
+            the reflector leaves to another one (``for_world``); when a reflector's state or scores are not of the
+            videos that it was given.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -204,6 +207,7 @@ class Reflect(Transform):
         parent = self.parent
         if parent is not None:
             try:
+                self._check_world(parent)
                 self._check_env(parent.observation_spec)
             except ValueError:
                 self.reset_parent()  # it may be put onto another env
@@ -215,6 +219,17 @@ class Reflect(Transform):
             0.0, 1.0, shape=(*observation_spec.shape, 1), dtype=torch.float32, device=observation_spec.device
         )
         return observation_spec
+
+    def _check_world(self, env: EnvBase) -> None:
+        """Raises ``ValueError`` over imagination that the reflector leaves to another one."""
+        while isinstance(env, TransformedEnv):
+            env = env.base_env
+        judge = self.reflector.for_world("imagined")
+        if isinstance(env, ImaginedEnv) and judge is not self.reflector:
+            raise ValueError(
+                f"the reflector {type(self.reflector).__name__} leaves imagination to its {type(judge).__name__}: pass "
+                "reflector.for_world('imagined') to Reflect"
+            )
 
     def _check_env(self, spec: Composite) -> None:
         """Raises ``ValueError`` unless the env shows every camera of the reflector, in its size."""

@@ -278,8 +278,8 @@ def _rule(source: Source, reflector: Reflector | None) -> StopRule | None:
 
 
 def _judge(source: Source, reflector: Reflector, mode: str) -> Reflector:
-    """The one of ``reflector`` that judges there (``for_world``), unless all of it was recorded as the judge."""
-    if source.models.get("reflector") == model_hash(reflector):
+    """The one of ``reflector`` that judges there (``for_world``); in the physics all of it, if so recorded."""
+    if mode == "physics" and source.models.get("reflector") == model_hash(reflector):
         return reflector
     return reflector.for_world("imagined" if mode == "imagination" else "real")
 
