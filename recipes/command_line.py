@@ -5,8 +5,9 @@ from __future__ import annotations
 import dis
 import os
 import sys
+import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
@@ -98,6 +99,26 @@ def at_least(low: int, **settings: int | tuple[int, ...]) -> None:
             raise ValueError(f"{option} is empty: name at least one number")
         if min(values) < low:
             raise ValueError(f"{option} must be at least {low}, got {min(values)}")
+
+
+def writable(out: Path, suffixes: Container[str] | None = None) -> Path:
+    """``out``, for which a folder is there now: asked before the work whose figures would be lost.
+
+    Args:
+        out: what ``--out`` names, or its default.
+        suffixes: that it may end in, with their dots.
+
+    Raises:
+        OSError: if no file can be written there.
+        ValueError: for another ending.
+    """
+    if suffixes is not None and out.suffix.lower() not in suffixes:
+        raise ValueError(f"--out must end like a picture, for instance {out.with_suffix('.png').name}, got {out}")
+    if out.is_dir():
+        raise IsADirectoryError(f"--out must be a file, {out} is a folder")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with open(out, "a") if out.exists() else tempfile.TemporaryFile(dir=out.parent):
+        return out
 
 
 def in_options(error: Exception) -> str:

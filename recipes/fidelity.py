@@ -17,7 +17,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from command_line import at_least, refusals
+from command_line import at_least, refusals, writable
 from episodes import demonstrations_and_exploration, split_by_context
 from gather_evidence import read_config
 from real_parts import parts_of
@@ -67,6 +67,7 @@ def main(settings: Settings) -> Path:
         use_threads(settings.num_threads)
         config = read_config(RunRecord.read(settings.run), settings.num_threads, settings.device)
         run = Run(config, RunFolder(settings.run), parts_of(config))
+        out = writable(settings.out or settings.run / f"fidelity_{settings.world_model}.json")
         measures: dict[str, Measure] = {"ssim": ssim}
         if settings.lpips is not None:
             measures["lpips"] = LPIPS.from_folder(settings.lpips).to(run.device)
@@ -83,7 +84,6 @@ def main(settings: Settings) -> Path:
     for name, option, what in (("lpips", settings.lpips, "a folder of weights"), ("fvd", settings.fvd, "a file")):
         if option is None:
             print(f"{name.upper()} is left out: --{name} names {what} (recipes/README.md, Fidelity, where to get it)")
-    out = settings.out or settings.run / f"fidelity_{settings.world_model}.json"
     out.write_text(json.dumps(figures, indent=1) + "\n")
     print(f"{out}: all figures")
     return out

@@ -15,8 +15,9 @@ import tyro
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.backend_bases import FigureCanvasBase
 
-from command_line import at_least, refusals
+from command_line import at_least, refusals, writable
 from gather_evidence import read_config
 from run import Run
 from run_folder import RunFolder
@@ -26,6 +27,7 @@ from worldenv_trl import keys
 from worldenv_trl.policies import policy_actor
 from worldenv_trl.report import RunRecord
 
+_PICTURES = {f".{kind}" for kind in FigureCanvasBase.get_supported_filetypes()}
 REAL, IMAGINED = "#1f6f8b", "#c8553d"
 
 
@@ -49,16 +51,16 @@ def main(settings: Settings) -> None:
     with refusals():
         at_least(2, columns=settings.columns)
         at_least(0, state=settings.state)
+        out = writable(settings.out or settings.run / "film_strip.png", _PICTURES)
         use_threads(settings.num_threads)
         config = read_config(RunRecord.read(settings.run), settings.num_threads, settings.device)
         run = Run(config, RunFolder(settings.run))
         models = run.world_model(), run.reflector(), run.rules()
         actor = policy_actor(run.policy(settings.policy).eval())
-    count = settings.state + 1
-    episodes = live(run, actor, count)
+        count = settings.state + 1
+        episodes = live(run, actor, count)
     rows = torch.arange(len(config.tasks)) * count + settings.state
     worlds = imagine(run, *models, episodes[rows])
-    out = settings.run / "film_strip.png" if settings.out is None else settings.out
     draw(worlds, config.tasks, settings.columns, out)
     print(f"{out}: {out.stat().st_size / 1e3:,.0f} kB")
 
@@ -87,7 +89,6 @@ def draw(worlds: TwoWorlds, tasks: tuple[str, ...], columns: int, out: Path) -> 
                     axes.set_ylabel(name, fontsize=8)
         task = tasks[int(worlds.episodes[keys.TASK_ID][row])].split("/")[-1].replace("_", " ")
         _curve(figure.add_subplot(grid[top + lines, :]), worlds, row, task, steps)
-    out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, bbox_inches="tight")
     plt.close(figure)
 

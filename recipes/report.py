@@ -59,6 +59,8 @@ def write(settings: Report, parts: Parts | None = None) -> Path:
     """
     record = RunRecord.read(settings.run)
     out = settings.run / "report.html" if settings.out is None else settings.out
+    if out.is_dir():
+        raise IsADirectoryError(f"--out must be a file, {out} is a folder")
     if not out.parent.is_dir():
         raise FileNotFoundError(f"the folder {out.parent} does not exist: make it, or choose another --out")
     if settings.episodes_per_task < 1 or settings.clips_per_kind < 0:

@@ -17,7 +17,7 @@ import shutil
 import tempfile
 import time
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ import yaml
 import processes
 from folder_lock import FolderLock, lock_folder
 from loggers import Loggers
-from worldenv_trl.report import machine_versions
+from worldenv_trl.report import machine_versions, read_metrics
 
 MIN_FREE_GB = 1.0
 FREE = {"run_dir", "num_threads", "device", "parallel", "collectors", "checkpoint_minutes", "logger"}
@@ -120,7 +120,8 @@ class RunFolder:
             tasks: digest of each task, by name.
 
         Raises:
-            ValueError: if ``config.yaml`` exists and differs, naming the first settings that do, or a task has changed.
+            ValueError: if ``config.yaml`` exists and differs, naming the first settings that do, or a task has changed;
+                if a file of the run is damaged.
             BlockingIOError: if another process runs on the folder, naming it.
             OSError: if less than :data:`MIN_FREE_GB` is free on the disk.
         """
@@ -136,7 +137,7 @@ class RunFolder:
             )
         stored = self.path / "config.yaml"
         if stored.exists():
-            old = yaml.safe_load(stored.read_text())
+            old = _read(stored, yaml.safe_load)
             # What has become a setting since then was at its default.
             before, now = _flat(_plain(dataclasses.asdict(type(config)()))) | _flat(old), _flat(new)
             changed = [key for key in now if before.get(key) != now[key] and key not in FREE]
@@ -155,7 +156,7 @@ class RunFolder:
     def _note_tasks(self, tasks: dict[str, str]) -> None:
         """Notes the digests of the tasks in ``tasks.json``, once."""
         path = self.path / "tasks.json"
-        noted = json.loads(path.read_text()) if path.exists() else {}
+        noted = _read(path, json.loads) if path.exists() else {}
         changed = [task for task, digest in tasks.items() if noted.get(task, digest) != digest]
         if changed:
             raise ValueError(
@@ -258,16 +259,22 @@ class RunFolder:
         self.loggers = Loggers.open(config.logger, self.path, settings)
 
     def read_metrics(self, stage: str | None = None) -> list[dict[str, Any]]:
-        """The lines of ``metrics.jsonl``, of one stage if named. A last line cut short by a crash is left out."""
+        """The lines of ``metrics.jsonl``, of one stage if named; see :func:`read_metrics`."""
         if not self.metrics_path.exists():
             return []
-        lines = []
-        for text in self.metrics_path.read_text().splitlines():
-            try:
-                lines.append(json.loads(text))
-            except json.JSONDecodeError:
-                continue
+        lines = read_metrics(self.path)
         return [line for line in lines if stage in (None, line["stage"])]
+
+
+def _read(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
+    """The mapping in a file of the run."""
+    try:
+        found = parse(path.read_text())
+    except (ValueError, yaml.YAMLError) as error:
+        found = " ".join(str(error).split())
+    if not isinstance(found, dict):
+        raise ValueError(f"{path} cannot be read ({found}): restore it from a copy, or use another --run-dir")
+    return found
 
 
 def _plain(value: Any) -> Any:

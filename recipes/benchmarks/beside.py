@@ -20,7 +20,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from command_line import at_least, refusals
+from command_line import at_least, refusals, writable
 from episodes import demonstrations_and_exploration, split_by_context
 from explore import own_episodes
 from gather_evidence import read_config
@@ -62,12 +62,12 @@ def main(settings: Settings) -> Path:
         config = read_config(RunRecord.read(settings.run), settings.num_threads, "cpu")
         run = Run(config, RunFolder(settings.run))
         path = run.folder.named_checkpoint(settings.reflector, "train_reflector")
+        out = writable(settings.out or settings.run / f"beside_{path.name}.json")
         judge = run.parts.reflector.load(path).eval().for_world("imagined")
         if judge.reads_video:
             raise ValueError(f"the judge in {path} looks at videos, of which there are none here: it must read paths")
         successes = kept_out_successes(run, settings.episodes_per_task)
         figures = measure(run, judge, successes, settings)
-    out = settings.out or settings.run / f"beside_{path.name}.json"
     out.write_text(json.dumps(figures, indent=1) + "\n")
     print(table(figures))
     print(f"{out}: all figures")

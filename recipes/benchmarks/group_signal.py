@@ -34,7 +34,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from command_line import at_least, refusals
+from command_line import at_least, refusals, writable
 from gather_evidence import read_config
 from group_views import (
     AHEAD,
@@ -116,6 +116,11 @@ def main(settings: Settings) -> Path:
         folder = settings.groups or settings.run / "signal" / paths["policy"].name
         models = {"policy": policy, "world_model": world_model, "reflector": judge.reflector}
         hashes = {name: model_hash(model) for name, model in models.items()}
+        names = [
+            path.name if path.parent == run.folder.path / "checkpoints" else f"{path.name}_{hashes[name][:8]}"
+            for name, path in paths.items()
+        ]
+        out = writable(settings.out or folder / f"{'-'.join(names[1:])}.json")
         groups = real_groups(run, policy, draw, folder, settings.overwrite)
         groups.episodes.require("the world model", world_model.cameras, world_model.image_size)
         groups.episodes.require("the reflector", judge.reflector.cameras, judge.reflector.image_size)
@@ -128,12 +133,6 @@ def main(settings: Settings) -> Path:
         if before is not None:
             _check_comparable(report, before, settings.against)
     report |= measure(run, groups, world_model, judge, settings, before)
-    names = [
-        path.name if path.parent == run.folder.path / "checkpoints" else f"{path.name}_{hashes[name][:8]}"
-        for name, path in paths.items()
-    ]
-    out = settings.out or folder / f"{'-'.join(names[1:])}.json"
-    out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
     print(markdown(report))
     print(f"\n{out}: all figures; measured in {report['seconds']:.0f} s")

@@ -17,10 +17,11 @@ import tyro
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.backend_bases import FigureCanvasBase
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from command_line import refusals
+from command_line import refusals, writable
 from learning_curves import MODES, SPLITS, Curve, bootstrap_interval, common, read_curve
 
 
@@ -37,8 +38,9 @@ def main(settings: Settings) -> None:
         if not settings.curves:
             raise ValueError("name at least one folder")
         variants = by_label([read_curve(path) for path in settings.curves])
+        out = writable(settings.out, {f".{kind}" for kind in FigureCanvasBase.get_supported_filetypes()})
         print(table(variants))
-        draw(variants, settings.out)
+        draw(variants, out)
     print(f"\n{settings.out}")
 
 
@@ -109,7 +111,6 @@ def draw(variants: dict[str, list[Curve]], out: Path) -> None:
         axes.set_xlabel("real rollouts")
     grid[0, 0].legend(fontsize=8, title="variant (seeds)", title_fontsize=8)
     figure.tight_layout()
-    out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out)
     plt.close(figure)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import world_env
-from command_line import expected, one_line_errors, refusals
+from command_line import expected, one_line_errors, refusals, writable
 from demonstrate import check_solved
 from run_folder import RunFolder
 from stages import open_run, rerun
@@ -92,3 +92,17 @@ def test_a_mistake_in_a_stage_keeps_its_traceback(tiny):
 
     with pytest.raises(ValueError, match="reshape"):
         rerun("sft", mistaken, open_run(tiny))
+
+
+def test_a_place_that_takes_no_file_is_named_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("kept")
+    for out, error in (
+        (tmp_path, "is a folder"),
+        (tmp_path / "file" / "out.json", "file"),
+        (tmp_path / "strip.xyz", "must end like a picture, for instance strip.png"),
+    ):
+        with pytest.raises((OSError, ValueError), match=error):
+            writable(out, {".png", ".json", ""})
+    assert writable(tmp_path / "new" / "out.json") == tmp_path / "new" / "out.json"
+    assert list((tmp_path / "new").iterdir()) == []  # nothing is left there yet
+    assert writable(tmp_path / "file").read_text() == "kept"

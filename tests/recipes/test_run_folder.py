@@ -95,3 +95,21 @@ def test_a_task_that_has_changed_since_is_named(tmp_path):
     folder.open(config, {"a.bddl": "1", "b.bddl": "2"})
     with pytest.raises(ValueError, match=r"b.bddl has changed since .* was made: use another --run-dir"):
         folder.open(config, {"a.bddl": "1", "b.bddl": "3"})
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "tasks.json"])
+@pytest.mark.parametrize("text", ["", "[1, 2", "just words", "\x00\x01"])
+def test_a_damaged_file_is_named_with_the_remedy_and_left(tmp_path, name, text):
+    folder = RunFolder(tmp_path / "run")
+    folder.open(PRESETS["smoke"][1], {"task": "digest"})
+    (folder.path / name).write_text(text)
+    with pytest.raises(ValueError, match=rf"{name} cannot be read \(.*\): restore it from a copy, or use another"):
+        RunFolder(folder.path).open(PRESETS["smoke"][1], {"task": "digest"})
+    assert (folder.path / name).read_text() == text
+
+
+def test_lines_that_are_no_figures_are_left_out(folder):
+    folder.log("sft", loss=1.0)
+    with folder.metrics_path.open("a") as file:
+        file.write('[1]\n"sft"\n{"loss": 2.0}\n{"stage": "sft", "lo')
+    assert [line["loss"] for line in folder.read_metrics()] == [1.0]

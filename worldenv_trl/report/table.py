@@ -10,7 +10,7 @@ PROTOCOLS = ("physics", "reflector")
 
 
 def read_metrics(run_dir: str | Path) -> list[dict[str, Any]]:
-    """The lines of ``metrics.jsonl``; a line cut short by a crash is left out.
+    """The lines of ``metrics.jsonl``; one that a crash cut short, or that is of no stage, is left out.
 
     Raises:
         FileNotFoundError: if the folder holds no ``metrics.jsonl``.
@@ -24,7 +24,7 @@ def read_metrics(run_dir: str | Path) -> list[dict[str, Any]]:
             lines.append(json.loads(text))
         except json.JSONDecodeError:
             continue
-    return lines
+    return [line for line in lines if isinstance(line, dict) and "stage" in line]
 
 
 def summary_table(run_dir: str | Path) -> str:
