@@ -90,8 +90,8 @@ class Explore:
     equally. 0 is the greedy policy."""
     replay_share: float = 0.0
     """Share of the episodes that play successes among the others again, the hand moved aside: noise alone does not show
-    what a smooth path beside the right one comes to, and smooth is what LOOP makes a policy. 0 until LOOP has been
-    better with it on three seeds (``RESULTS.md``); .25 is what was measured."""
+    what a smooth path beside the right one comes to, and smooth is what LOOP makes a policy. 0, for the judge is better
+    with it (.25 was measured) and LOOP is not, on three seeds of three tasks (``RESULTS.md``)."""
     replay_shift_m: float = 0.08
     """The farthest that a hand is moved there (m), in any direction."""
     num_envs: int = 32
