@@ -47,7 +47,7 @@ from worldenv_trl.scenes import list_tasks
         ("sft", {"suite": "gaol"}, "unknown suite 'gaol'"),
         ("sft", {"episodes_per_task": 0}, "--episodes-per-task must be at least 1, got 0"),
         ("sft", {"num_threads": 0}, "num_threads must be at least 1, got 0"),
-        ("sft", {"seed": -1}, "seed must be a whole number of at least 0, got -1"),
+        ("sft", {"seed": -1}, "seed must be at least 0, got -1"),
     ],
 )
 def test_what_cannot_be_measured_is_refused(name, settings, message, tmp_path):

@@ -164,7 +164,7 @@ def test_a_patch_of_8_at_128_px_has_the_trunk_of_a_patch_of_4_at_64_px():
         ({"memory_stride": 9}, "memory_stride must lie between 1 and chunk_length=8, got 9"),
         ({"blocks": (1,)}, "equally long"),
         ({"precision": "float8"}, "precision must be auto, float32 or bfloat16, got 'float8'"),
-        ({"width": 12}, "must be a multiple of 8, got 12"),
+        ({"width": 12}, "must be a positive multiple of 8, got 12"),
         ({"unroll_prob": 2}, "unroll_prob must lie between 0 and 1, got 2"),
         ({"noise_prob": -0.5}, "noise_prob must lie between 0 and 1, got -0.5"),
         ({"moving_weight": -1.0}, "must not be negative, got 0.15 and -1.0"),
