@@ -317,3 +317,20 @@ def test_a_missing_world_model_is_an_error(tmp_path):
     imagine(tmp_path / "a.mcap", Painter(), steps=4)
     with pytest.raises(ValueError, match="pass its world_model"):
         replay(tmp_path / "a.mcap")
+
+
+class Whole(OfTwo):
+    """Another one judges either world, where somebody asks."""
+
+    def for_world(self, world: str) -> Reflector:
+        return self.imagined
+
+
+def test_the_physics_is_judged_by_all_of_a_reflector_that_judged_it(tmp_path):
+    env, judge = TabletopEnv(TASK, 1, image_size=SIZE, seed=0, with_sim_state=True, proprio="commanded"), Whole()
+    judged = TransformedEnv(env, Reflect(judge, StopRule(0.5)))
+    rollout = next(iter(GroupCollector(judged, ExpertPolicy(env), groups_per_batch=1, group_size=1)))[:, 0]
+    with RolloutWriter(tmp_path / "real.mcap", **provenance(judged, models={"reflector": judge})) as writer:
+        writer.write(rollout)
+    report = replay(tmp_path / "real.mcap", reflector=judge, write=False)
+    assert report.exact is True and not report.notes
