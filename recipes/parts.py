@@ -13,7 +13,7 @@ from config import WorldEnvConfig
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.language import split_words
 from worldenv_trl.policies import OFTConfig, OFTPolicy, Policy
-from worldenv_trl.pretrained import OtherClassError, saved_class
+from worldenv_trl.pretrained import OtherClassError
 from worldenv_trl.reflectors import (
     CompactLessons,
     CompactReflector,
@@ -30,9 +30,6 @@ from worldenv_trl.vision import load_vision
 from worldenv_trl.world_models import VideoWorldModel, VideoWorldModelConfig, WorldModel
 
 PROPRIO = "commanded"  # the same in physics and imagination, so the policy meets no gap between them
-
-CHECKPOINTS = {"policy": ("sft", "post_train*"), "world_model": ("world_model*",), "reflector": ("reflector*",)}
-"""Names of each part's checkpoints in a run folder, as patterns."""
 
 Kind = TypeVar("Kind", bound=nn.Module)
 
@@ -74,19 +71,6 @@ def cameras_of(config: WorldEnvConfig) -> dict[str, dict[str, Camera]]:
     """Where each of the run's cameras stands, by its name and the instruction of the scene."""
     tasks = [load_task(task) for task in config.tasks]
     return {name: {task.language: task.camera(name) for task in tasks} for name in config.cameras}
-
-
-def check_made_of(checkpoints: Path, parts: Parts) -> None:
-    """Raises ``ValueError`` for a checkpoint of a run, in the folder of them all, that none of its ``parts`` loads."""
-    for kind, patterns in CHECKPOINTS.items():
-        known = getattr(parts, kind).known
-        for path in (path for pattern in patterns for path in sorted(checkpoints.glob(pattern)) if known):
-            made = saved_class(path)
-            if made is not None and made not in known:
-                raise ValueError(
-                    f"{path} holds {made}, and the run's {kind.replace('_', ' ')} is {' or '.join(known)} now: use "
-                    "another --run-dir, or the parts that it was made with"
-                )
 
 
 def make_policy(config: WorldEnvConfig) -> OFTPolicy:

@@ -21,11 +21,13 @@ from typing import Any
 import tyro
 
 from command_line import one_line_errors
-from parts import CHECKPOINTS, COMPACT, Kind, Part, Parts
+from parts import COMPACT, Kind, Part, Parts
 from worldenv_trl.devices import choose_device
 from worldenv_trl.policies import AutoregressiveActor, LaplaceActor, Policy, policy_actor, scale_bounds
 from worldenv_trl.record import model_hash, parse_edit, read_metadata, replay
 from worldenv_trl.record.replay.source import open_rollout
+
+_NAMES = {"policy": ("sft", "post_train*"), "world_model": ("world_model*",), "reflector": ("reflector*",)}
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,7 @@ def _checkpoint(part: Part[Kind], name: str | None, file: Path, metadata: dict, 
     if name is not None and name != "recorded":
         named = folder / name
         return part.load(named if named.is_dir() else Path(name)).eval()
-    found = [path for pattern in CHECKPOINTS[kind] for path in folder.glob(pattern) if path.is_dir()]
+    found = [path for pattern in _NAMES[kind] for path in folder.glob(pattern) if path.is_dir()]
     if not found:
         option = kind.replace("_", "-")
         raise FileNotFoundError(f"no {kind.replace('_', ' ')} in {folder}: name a checkpoint with --{option}")

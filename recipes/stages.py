@@ -20,11 +20,12 @@ from checks import check_config, check_shares
 from command_line import expected, in_options, refusals
 from config import PRESETS, WorldEnvConfig
 from libero_files import from_libero, with_files
-from parts import Parts, check_made_of
+from parts import Parts
 from real_parts import parts_of
 from run import Run
 from run_folder import RunFolder
 from threads import use_threads
+from worldenv_trl.pretrained import saved_class
 from worldenv_trl.scenes import load_task
 
 Work = Callable[..., None]
@@ -33,6 +34,15 @@ Work = Callable[..., None]
 
 SHARED = {"sft", "train_world_model", "train_reflector", "post_train"}
 """Kinds of stages that all processes work on; the others are the main one's."""
+
+
+_MAKES = {
+    "sft": "policy",
+    "post_train": "policy",
+    "train_world_model": "world_model",
+    "train_reflector": "reflector",
+}
+"""The part that a kind of stage makes."""
 
 
 @dataclass(frozen=True)
@@ -140,9 +150,21 @@ def open_run(config: WorldEnvConfig, parts: Parts | None = None) -> Run:
 def _check_and_open(config: WorldEnvConfig, parts: Parts, folder: RunFolder, count: int) -> None:
     check_config(config, parts)
     check_shares(config, count)
-    check_made_of(folder.path / "checkpoints", parts)
+    check_made_of(config, parts, folder)
     folder.open(config, {task: load_task(task).digest for task in config.tasks})
     folder.start_logging(config)
+
+
+def check_made_of(config: WorldEnvConfig, parts: Parts, folder: RunFolder) -> None:
+    """Raises ``ValueError`` if a checkpoint of one of the run's stages is of a class that ``parts`` do not load."""
+    for stage in (stage for stage in plan(config) if stage.kind in _MAKES):
+        name, made = _MAKES[stage.kind], saved_class(folder.path / stage.makes)
+        known = getattr(parts, name).known
+        if known and made is not None and made not in known:
+            raise ValueError(
+                f"{folder.path / stage.makes} holds {made}, and the run's {name.replace('_', ' ')} is "
+                f"{' or '.join(known)} now: use another --run-dir, or the parts that it was made with"
+            )
 
 
 def _finished(stage: Stage, folder: RunFolder) -> bool:

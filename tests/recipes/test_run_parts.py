@@ -18,7 +18,7 @@ def left_by_another_run(tiny, name, text):
     ("name", "message"),
     [
         ("sft", "sft holds OtherPolicy, and the run's policy is OFTPolicy now: use another --run-dir"),
-        ("post_train_2", "the run's policy is OFTPolicy"),
+        ("post_train", "the run's policy is OFTPolicy"),
         ("world_model", "the run's world model is VideoWorldModel"),
         ("reflector", "the run's reflector is CompactReflector or DualReflector"),
     ],
@@ -34,6 +34,11 @@ def test_a_folder_of_the_same_parts_goes_on(tiny):
     left_by_another_run(tiny, "sft", json.dumps({"class": "OFTPolicy"}))
     left_by_another_run(tiny, "reflector", json.dumps({"class": "DualReflector"}))
     left_by_another_run(tiny, "world_model", "not json")  # of a part that says nothing of itself
+    open_run(tiny).close()
+
+
+def test_a_checkpoint_that_no_stage_has_made_is_no_matter(tiny):
+    left_by_another_run(tiny, "post_train_theirs", json.dumps({"class": "ExternalPolicy"}))
     open_run(tiny).close()
 
 
