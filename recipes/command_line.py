@@ -7,7 +7,7 @@ import os
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
@@ -101,19 +101,24 @@ def at_least(low: int, **settings: int | tuple[int, ...]) -> None:
             raise ValueError(f"{option} must be at least {low}, got {min(values)}")
 
 
-def writable(out: Path, suffixes: Container[str] | None = None) -> Path:
+def writable(out: Path, *, plot: bool = False) -> Path:
     """``out``, for which a folder is there now: asked before the work whose figures would be lost.
 
     Args:
         out: what ``--out`` names, or its default.
-        suffixes: that it may end in, with their dots.
+
+    Keyword Args:
+        plot: it must end like a format of matplotlib's.
 
     Raises:
         OSError: if no file can be written there.
         ValueError: for another ending.
     """
-    if suffixes is not None and out.suffix.lower() not in suffixes:
-        raise ValueError(f"--out must end like a picture, for instance {out.with_suffix('.png').name}, got {out}")
+    if plot:
+        from matplotlib.backend_bases import FigureCanvasBase  # not for the commands that draw nothing
+
+        if out.suffix.lower().removeprefix(".") not in FigureCanvasBase.get_supported_filetypes():
+            raise ValueError(f"--out must end like a picture, for instance {out.with_suffix('.png').name}, got {out}")
     if out.is_dir():
         raise IsADirectoryError(f"--out must be a file, {out} is a folder")
     out.parent.mkdir(parents=True, exist_ok=True)

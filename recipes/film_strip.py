@@ -15,7 +15,6 @@ import tyro
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
-from matplotlib.backend_bases import FigureCanvasBase
 
 from command_line import at_least, refusals, writable
 from gather_evidence import read_config
@@ -27,7 +26,6 @@ from worldenv_trl import keys
 from worldenv_trl.policies import policy_actor
 from worldenv_trl.report import RunRecord
 
-_PICTURES = {f".{kind}" for kind in FigureCanvasBase.get_supported_filetypes()}
 REAL, IMAGINED = "#1f6f8b", "#c8553d"
 
 
@@ -51,7 +49,7 @@ def main(settings: Settings) -> None:
     with refusals():
         at_least(2, columns=settings.columns)
         at_least(0, state=settings.state)
-        out = writable(settings.out or settings.run / "film_strip.png", _PICTURES)
+        out = writable(settings.out or settings.run / "film_strip.png", plot=True)
         use_threads(settings.num_threads)
         config = read_config(RunRecord.read(settings.run), settings.num_threads, settings.device)
         run = Run(config, RunFolder(settings.run))

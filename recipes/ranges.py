@@ -78,6 +78,7 @@ RANGES: dict[str, Range] = {
     "world_model.patch": _ONE,
     "world_model.holdout": _SHARE,
     "reflector.batch_size": _ONE,
+    "reflector.lr": _RATE,
     "reflector.imagined_share": _SHARE,
     "reflector.path_steps": _ZERO,
     "reflector.holdout": _SHARE,

@@ -16,7 +16,7 @@ import tyro
 from PIL import Image
 from torchrl.envs.utils import step_mdp
 
-from command_line import at_least, refusals
+from command_line import at_least, refusals, writable
 from task_names import SUITES
 from threads import use_threads
 from worldenv_trl import keys
@@ -82,7 +82,7 @@ def check(settings: Sheet) -> None:
         raise ValueError(f"--moments must be shares of an episode, each from 0 to 1, got {shown}")
     if Image.registered_extensions().get(settings.out.suffix.lower()) not in Image.SAVE:
         raise ValueError(f"--out must be the name of an image such as scenes.png, got {settings.out}")
-    settings.out.parent.mkdir(parents=True, exist_ok=True)
+    writable(settings.out)
     RendererPool(1).close()  # without GL this says what to install, once and not for each task
 
 

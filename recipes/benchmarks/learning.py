@@ -19,7 +19,6 @@ from typing import Annotated, Any
 
 import torch
 import tyro
-import yaml
 from torchrl.envs.utils import ExplorationType
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -36,6 +35,7 @@ from run_folder import RunFolder
 from stages import open_run, rerun
 from worldenv_trl.metrics import advantage_correlation
 from worldenv_trl.policies import Policy, policy_actor
+from worldenv_trl.report import RunRecord
 
 _SHARED = ("tasks", "cameras", "image_size", "chunk_length", "max_steps")  # a policy is of these
 
@@ -137,7 +137,7 @@ def start_of(source: Path, config: WorldEnvConfig) -> Path:
     checkpoint = RunFolder(source).require_checkpoint("sft", "sft")
     if source.resolve() == config.run_dir.resolve():
         raise ValueError(f"--run-dir is the --source, {source}: name a folder for the curve alone")
-    stored = yaml.safe_load((source / "config.yaml").read_text())
+    stored = RunRecord.read(source).config
     for name in _SHARED:
         now = getattr(config, name)
         now = list(now) if isinstance(now, tuple) else now

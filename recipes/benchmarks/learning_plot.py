@@ -17,7 +17,6 @@ import tyro
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
-from matplotlib.backend_bases import FigureCanvasBase
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -38,7 +37,7 @@ def main(settings: Settings) -> None:
         if not settings.curves:
             raise ValueError("name at least one folder")
         variants = by_label([read_curve(path) for path in settings.curves])
-        out = writable(settings.out, {f".{kind}" for kind in FigureCanvasBase.get_supported_filetypes()})
+        out = writable(settings.out, plot=True)
         print(table(variants))
         draw(variants, out)
     print(f"\n{settings.out}")

@@ -102,7 +102,7 @@ def test_a_place_that_takes_no_file_is_named_before_the_work(tmp_path):
         (tmp_path / "strip.xyz", "must end like a picture, for instance strip.png"),
     ):
         with pytest.raises((OSError, ValueError), match=error):
-            writable(out, {".png", ".json", ""})
+            writable(out, plot=out.suffix == ".xyz")
     assert writable(tmp_path / "new" / "out.json") == tmp_path / "new" / "out.json"
     assert list((tmp_path / "new").iterdir()) == []  # nothing is left there yet
     assert writable(tmp_path / "file").read_text() == "kept"

@@ -18,7 +18,6 @@ ELSEWHERE = {
     "reflector.vision_blocks",
     "reflector.encoder_steps",
     "reflector.steps",
-    "reflector.lr",
     "reflector.threshold",
     "reflector.consecutive",
     "real_size.frame_size",
