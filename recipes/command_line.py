@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import ParamSpec
 
 import worldenv_trl
-from processes import FailedElsewhere, end_quietly
+from processes import FailedElsewhere, end_quietly, is_main
 
 P = ParamSpec("P")
 
@@ -37,8 +37,12 @@ _SMALLER = (
 )
 
 
+INTERRUPTED = 130  # what a shell makes of SIGINT
+
+
 def one_line_errors(main: Callable[P, int | None]) -> Callable[P, int]:
-    """``main`` with :func:`expected` errors and warnings as lines on stderr; returns 1 after an error."""
+    """``main`` with :func:`expected` errors, warnings and Ctrl-C as lines on stderr; returns 1 after an error, 130 when
+    interrupted."""
 
     @wraps(main)
     def run(*arguments: P.args, **options: P.kwargs) -> int:
@@ -46,6 +50,9 @@ def one_line_errors(main: Callable[P, int | None]) -> Callable[P, int]:
             warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
             try:
                 return main(*arguments, **options) or 0
+            except KeyboardInterrupt:
+                print("interrupted", file=sys.stderr)
+                return INTERRUPTED
             except Exception as error:
                 if not expected(error):
                     raise
@@ -57,9 +64,13 @@ def one_line_errors(main: Callable[P, int | None]) -> Callable[P, int]:
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Turns :func:`expected` errors into ``SystemExit("error: ...")``."""
+    """Turns :func:`expected` errors into ``SystemExit("error: ...")``, Ctrl-C into a line and ``SystemExit(130)``."""
     try:
         yield
+    except KeyboardInterrupt as error:
+        if is_main():
+            print("interrupted", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from error
     except FailedElsewhere:
         end_quietly()
     except Exception as error:

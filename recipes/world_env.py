@@ -20,6 +20,7 @@ from contextlib import closing
 
 import processes
 import report
+from command_line import refusals
 from config import WorldEnvConfig
 from demonstrate import demonstrate
 from dry_run import dry_run, split
@@ -51,7 +52,8 @@ def run_all(config: WorldEnvConfig, parts: Parts | None = None) -> None:
     run = open_run(config, parts)
     with closing(run.folder.loggers), closing(run):
         run_stages(run, WORKS)
-        processes.on_main(lambda: _conclude(run))
+        with refusals():
+            processes.on_main(lambda: _conclude(run))
 
 
 def _conclude(run: Run) -> None:

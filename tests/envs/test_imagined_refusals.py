@@ -71,9 +71,11 @@ def test_a_row_that_is_not_stepped_may_hold_anything():
     assert env.step(td.set("_step", active))["next", STATE].isfinite().all()
 
 
-@pytest.mark.parametrize("size", [[4], [2, 0], [1, 2, 3]])
+@pytest.mark.parametrize("size", [8, [4], [2, 0], [1, 2, 3]])
 def test_unusable_batch_sizes_are_refused(size):
-    with pytest.raises(ValueError, match="batch_size"):
+    with pytest.raises(
+        ValueError, match=re.escape(f"batch_size must be [contexts, rollouts of each], both at least 1, got {size}")
+    ):
         ImaginedEnv(CountingWorldModel(), FK, make_contexts(), size, max_steps=C)
 
 

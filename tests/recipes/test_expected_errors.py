@@ -55,6 +55,16 @@ def test_what_goes_wrong_in_the_program_keeps_its_traceback(mistake, tmp_path, m
         one_line_errors(mistake)()
 
 
+def test_ctrl_c_is_one_line(capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    assert one_line_errors(interrupted)() == 130
+    with pytest.raises(SystemExit, match="130"), refusals():
+        interrupted()
+    assert capsys.readouterr().err == "interrupted\n" * 2
+
+
 def test_a_full_gpu_is_answered_with_the_settings_that_take_less(capsys):
     said = "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 23.5 GiB"
 

@@ -127,7 +127,7 @@ def test_no_display_and_no_rerun_are_said(run, capsys, monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_rollouts_are_saved_for_rerun_without_a_display(run, tmp_path, capsys):
+def test_rollouts_are_saved_for_rerun_without_a_display(run, tmp_path, capsys, monkeypatch):
     pytest.importorskip("rerun")
     real = run / "rollouts" / "real.mcap"
     assert call(view_recipe, real, "--rollout", 1, "--save", tmp_path / "a.rrd") == 0
@@ -136,6 +136,9 @@ def test_rollouts_are_saved_for_rerun_without_a_display(run, tmp_path, capsys):
     assert "pass --overwrite" in capsys.readouterr().err
     assert call(view_recipe, real, "--rollout", 9, "--save", tmp_path / "b.rrd") == 1
     assert "holds the rollouts 0 to 1, not 9" in capsys.readouterr().err
+    monkeypatch.setattr(view_recipe, "MOST", 1)
+    assert call(view_recipe, real, "--save", tmp_path / "c.rrd") == 0
+    assert "the first 1 of 2 rollouts" in capsys.readouterr().out
 
 
 def test_foxglove_gets_a_layout_of_the_recording(run, tmp_path, capsys, monkeypatch):

@@ -100,9 +100,9 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        batch = torch.Size(batch_size)
+        batch = torch.Size([batch_size] if isinstance(batch_size, int) else batch_size)
         if len(batch) != 2 or min(batch) < 1:
-            raise ValueError(f"batch_size must be [contexts, rollouts of each], both at least 1, got {list(batch)}")
+            raise ValueError(f"batch_size must be [contexts, rollouts of each], both at least 1, got {batch_size}")
         if max_steps < 1:
             raise ValueError(f"max_steps must be at least 1, got {max_steps}")
         if proprio not in ("commanded", "measured"):
