@@ -12,7 +12,7 @@ import torch
 
 from config import WorldEnvConfig
 from libero_files import convert, from_libero
-from physics import recording, tabletop
+from physics import reached_goal, recording, tabletop
 from resumable import Outside, Resumable
 from resumable_recording import ResumableRecording
 from run import Run
@@ -54,7 +54,7 @@ def demonstrate(run: Run) -> None:
             )
             rollouts = next(iter(collector))[:, 0]
             collector.shutdown()
-            solved = (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1)
+            solved = reached_goal(rollouts)
             check_solved(task, solved)
             recorded.writer.write(rollouts)
             folder.log(

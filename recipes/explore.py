@@ -12,13 +12,12 @@ from typing import Any
 
 from collecting import of_worker
 from config import Explore
-from physics import chunk_player, exploring_actor, recording, step_env
+from physics import chunk_player, exploring_actor, reached_goal, recording, step_env
 from replayed import Successes, play_again, replays_per_task
 from resumable import Outside, Resumable
 from resumable_recording import ResumableRecording
 from run import Run
 from stages import run_alone
-from worldenv_trl import keys
 
 
 def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
@@ -69,9 +68,7 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
                 recorded.writer.write(rollouts)
                 if successes is not None:
                     successes.note(rollouts)
-                reached.append(
-                    (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1).float().mean().item()
-                )
+                reached.append(reached_goal(rollouts).float().mean().item())
             collector.shutdown(close_env=False)
             folder.log(
                 target, scale_factor=factor, episodes=waves * settings.num_envs, success=sum(reached) / len(reached)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import torch
+from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker, TransformedEnv
 from torchrl.modules import MultiStepActorWrapper
@@ -12,6 +14,7 @@ from torchrl.modules import MultiStepActorWrapper
 from config import WorldEnvConfig
 from parts import PROPRIO
 from seeds import stage_seed
+from worldenv_trl import keys
 from worldenv_trl.envs import TabletopEnv, chunked, context_id
 from worldenv_trl.policies import AutoregressiveActor, DeviceBridge, LaplaceActor, Policy, policy_actor, scale_bounds
 from worldenv_trl.record import provenance
@@ -78,6 +81,11 @@ def exploring_actor(config: WorldEnvConfig, policy: Policy, scale_factor: float)
     bounds = scale_bounds(policy, config.scale_floor, share=config.scale_share)
     events = 0 if config.post_train.ratio_level == "token" else 1
     return policy_actor(policy, scale_factor=scale_factor, log_scale_bounds=bounds, event_dims=events)
+
+
+def reached_goal(rollouts: TensorDictBase) -> torch.Tensor:
+    """Whether the goal held at any step of each rollout ``[*B, T]``: bool ``[*B]``."""
+    return (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1)
 
 
 def recording(config: WorldEnvConfig, env: EnvBase, stage: str, models: dict | None = None, **more: Any) -> dict:

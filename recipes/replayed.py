@@ -18,7 +18,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import MultiStepActorWrapper
 
-from physics import chunk_player, exploring_actor, starting_at, step_env
+from physics import chunk_player, exploring_actor, reached_goal, starting_at, step_env
 from resumable import Outside, Resumable
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
@@ -130,7 +130,7 @@ def play_again(run: Run, policy: Policy, successes: Successes, recorded: Resumab
         )
         rollouts = next(iter(collector))[:, 0]
         recorded.writer.write(rollouts)
-        reached += (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1).tolist()
+        reached += reached_goal(rollouts).tolist()
         collector.shutdown()
     if reached:
         run.folder.log(

@@ -19,6 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the recipes besi
 
 from command_line import at_least, refusals
 from gather_evidence import read_config
+from physics import reached_goal
 from run_folder import RunFolder
 from worldenv_trl import keys
 from worldenv_trl.context_ids import UNKNOWN_CONTEXT, parts_of
@@ -101,7 +102,7 @@ def read_run(path: Path, policies: tuple[str, ...]) -> Covered:
 def _outcomes(path: Path) -> dict[int, bool]:
     """Whether the episode from each initial state reached the goal, in the order of their numbers."""
     rollouts = read_rollouts(path, keys=[keys.CONTEXT_ID, ("next", keys.SUCCESS), keys.MASK])
-    reached = (rollouts["next", keys.SUCCESS].squeeze(-1) & rollouts[keys.MASK]).any(-1).flatten().tolist()
+    reached = reached_goal(rollouts).flatten().tolist()
     return dict(sorted(zip(rollouts[keys.CONTEXT_ID][..., 0, 0].flatten().tolist(), reached, strict=True)))
 
 
