@@ -35,8 +35,8 @@ def check_shares(config: WorldEnvConfig, processes: int) -> None:
         )
 
 
-def check_ratio_level(config: WorldEnvConfig, policy: Policy) -> None:
-    """Raises ``ValueError`` for a ratio that the policy does not have."""
+def check_loop(config: WorldEnvConfig, policy: Policy) -> None:
+    """Raises ``ValueError`` for a ratio that the policy does not have, and if it has no mean to be held."""
     level = config.post_train.ratio_level
     if isinstance(policy, TokenPolicy) and policy.sequential and level == "step":
         raise ValueError(
@@ -47,6 +47,11 @@ def check_ratio_level(config: WorldEnvConfig, policy: Policy) -> None:
         raise ValueError(
             f"post_train.ratio_level must be step or chunk for {type(policy).__name__}, which does not act by tokens, "
             "got 'token'"
+        )
+    if isinstance(policy, TokenPolicy) and config.post_train.hold:
+        raise ValueError(
+            f"post_train.hold is for policies with a mean, and {type(policy).__name__} acts by tokens: it must be 0, "
+            f"got {config.post_train.hold:g}"
         )
 
 
@@ -105,6 +110,11 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             raise ValueError(f"{name} must be at least {len(config.tasks)}, one for each task, got {rows}")
     if not config.explore.scale_factors:
         raise ValueError("explore.scale_factors is empty: name at least one, for instance 1")
+    if config.post_train.hold and 0.0 not in config.explore.scale_factors:
+        raise ValueError(
+            "post_train.hold asks what greedy rollouts solved: explore.scale_factors must hold 0, got "
+            f"{', '.join(f'{factor:g}' for factor in config.explore.scale_factors)}"
+        )
     if replays_per_task(config.explore) >= config.explore.episodes_per_task:
         raise ValueError(
             f"explore.replay_share {config.explore.replay_share} of {config.explore.episodes_per_task} episodes a task "
@@ -141,6 +151,6 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             try:
                 made = make(config)
                 if name == "policy":
-                    check_ratio_level(config, made)
+                    check_loop(config, made)
             except ValueError as error:
                 raise ValueError(f"the {name.replace('_', ' ')} cannot be made of these settings: {error}") from error

@@ -173,6 +173,11 @@ class PostTrain:
     source_share: float = 0.0
     """Share in what is saved of the weights that LOOP began with; the running mean has the rest. After imagination a
     half gives back most of what LOOP breaks, if the policy solved nine in ten before; 0 is better if it solved less."""
+    hold: float = 0.0
+    """Weight of a pull of the policy's mean to where it was before LOOP, in units of its scale, on rollouts of tasks it
+    solves; their returns are not learned from. At 0 nothing is held."""
+    hold_from: float = 0.85
+    """A task is solved if this share of its greedy rollouts in exploration reached the goal."""
     scale_factor: float = 1.0
     """Behaviour and scored density use this multiple of the policy's scale, or of its temperature if it acts by tokens.
     """

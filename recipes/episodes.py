@@ -20,6 +20,12 @@ def demonstrations(run: Run) -> Episodes:
 
 def demonstrations_and_exploration(run: Run, rounds: int) -> tuple[Episodes, Episodes]:
     """Demonstrations, and the exploration of the first ``rounds`` rounds; frames stay on disk, in ``episodes/``."""
+    demonstrated, *explored = recorded_episodes(run, rounds)
+    return demonstrated, Episodes.cat(explored)
+
+
+def recorded_episodes(run: Run, rounds: int) -> list[Episodes]:
+    """The demonstrations, then the exploration of each of the first ``rounds`` rounds; frames as above."""
     files = [run.folder.require_rollouts("demonstrations", "demonstrate")]
     names = ["explore" + ("" if number == 1 else f"_{number}") for number in range(1, rounds + 1)]
     files += [run.folder.require_rollouts(name, "explore") for name in names]
@@ -32,7 +38,7 @@ def demonstrations_and_exploration(run: Run, rounds: int) -> tuple[Episodes, Epi
         except ValueError as error:  # the recordings are the record: nothing is lost with a store
             print(f"{str(error).split(': fill_store')[0]}: it is made anew from the recordings")
             parts = fill_store(store, files)
-    return parts[0], Episodes.cat(parts[1:])
+    return parts
 
 
 def split_by_context(episodes: Episodes, share: float, seed: int) -> tuple[Episodes, Episodes]:

@@ -17,6 +17,7 @@ from tensordict import TensorDictBase
 import processes
 from averaging import RunningMean
 from data_parallel import DataParallel, WholeOptimizer
+from holding import Hold
 from physics import exploring_actor, recording
 from probes import probe, probed_iterations, warning
 from resumable import Resumable
@@ -54,6 +55,7 @@ def post_train(
             that would be saved now, which it must leave as it is, like torch's random numbers.
     """
     config, settings = run.config, run.config.post_train
+    hold = Hold(run, source, models) if settings.hold else None
     run.seed_everything(target)
     policy = run.policy(source)
     groups = policy.post_training_parameters(settings.lora_rank)
@@ -70,7 +72,8 @@ def post_train(
 
     def make_loss(part: Policy) -> LOOPLoss:
         scored = actor if part is policy else exploring_actor(config, part, settings.scale_factor)
-        loss = LOOPLoss(scored, clip_epsilon=settings.clip_epsilon, ratio_level=settings.ratio_level, functional=False)
+        options: dict[str, Any] = {"ratio_level": settings.ratio_level, "hold_coef": settings.hold}
+        loss = LOOPLoss(scored, clip_epsilon=settings.clip_epsilon, functional=False, **options)
         if isinstance(part, TokenPolicy):
             loss.set_keys(action=keys.TOKENS)
         return loss
@@ -109,6 +112,11 @@ def post_train(
         advantage = rloo_advantage(returns)
         if settings.standardize:
             advantage = advantage / advantage.std().clamp_min(1e-6)
+        held = None
+        if hold is not None:
+            held = processes.gathered(hold.groups(mine))
+            advantage = advantage * ~held[:, None]
+            hold.refer(mine, processes.own_rows_of(held))
         mine[keys.ADVANTAGE] = _at_decisions(processes.own_rows_of(advantage), mine)
         about = {}
         if iteration in recorded and processes.is_main():  # of the weights that collected it
@@ -127,6 +135,8 @@ def post_train(
         waves.update_policy_weights_()
 
         metrics |= _wave_metrics(mine, returns, config.tasks)
+        if held is not None:
+            metrics["held_groups"] = held.float().mean().item()
         metrics["iteration_seconds"], started = time.monotonic() - started, time.monotonic()
         if iteration in probed:
             metrics |= processes.on_main(lambda: probe(run, mean_actor, imagination, alarm))

@@ -93,6 +93,8 @@ RANGES: dict[str, Range] = {
     "post_train.lora_lr": _WEIGHT,
     "post_train.head_lr": _RATE,
     "post_train.averaging": _SHARE,
+    "post_train.hold": _WEIGHT,
+    "post_train.hold_from": _SHARE,
     "post_train.source_share": _SHARE,
     "post_train.scale_factor": _RATE,
     "post_train.warmup_iterations": _ZERO,

@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from checks import check_ratio_level
+from checks import check_loop
 from command_line import expected, in_options
 from config import WorldEnvConfig
 from part_costs import Call, Size, counted, size
@@ -74,7 +74,7 @@ def rehearse(config: WorldEnvConfig, parts: Parts, published: dict[str, Callable
     _agree(found, config, made)
     if "policy" in made:
         with _noted(found, "policy"):
-            check_ratio_level(config, made["policy"])
+            check_loop(config, made["policy"])
     if not found.problems:
         for step in (_act, _imagine, _judge):
             with _noted(found, step.__name__.removeprefix("_")):

@@ -18,7 +18,7 @@ from tensordict.utils import NestedKey
 from torchrl.objectives import BCLoss
 
 import processes
-from checks import check_ratio_level
+from checks import check_loop
 from data_parallel import DataParallel, WholeOptimizer
 from episodes import demonstrations
 from parts import cameras_of
@@ -52,7 +52,7 @@ def fine_tune(run: Run) -> None:
     run.seed_everything("sft")
     samples = policy_samples(demonstrations(run), config.chunk_length)
     policy = run.parts.policy.make(config).to(run.device)
-    check_ratio_level(config, policy)
+    check_loop(config, policy)
     policy.fit_statistics(samples[keys.STATE], samples[keys.CHUNK])
     if isinstance(policy, TokenPolicy):
         _clone_tokens(policy, samples, run)

@@ -50,11 +50,14 @@ def update(
         in_keys: what the policy reads, and the tokens of one that acts by tokens.
         learner: of a :class:`LOOPLoss`, whose minibatches add up.
 
-    Decisions without an advantage teach nothing and are left out, but count among Eq. 5's steps. If there is no other
-    one, nothing moves: the optimiser's moments alone would.
+    Decisions that have no advantage and are not held teach nothing and are left out, but count among Eq. 5's steps. If
+    there is no other one, nothing moves: the optimiser's moments alone would.
     """
     mask = wave[keys.MASK]
     informative = mask & (wave[keys.ADVANTAGE].squeeze(-1) != 0)
+    held = [key for key in (keys.HELD, keys.REFERENCE_LOC, keys.REFERENCE_SCALE) if wave.get(key, None) is not None]
+    if held:
+        informative |= mask & wave[keys.HELD].squeeze(-1)
     counts = processes.gathered_values(int(informative.sum()))
     if not any(counts):
         return {"updates": 0, "kl_stop": 0.0}
@@ -63,7 +66,7 @@ def update(
     if not counts[processes.rank()]:
         chosen = torch.arange(1)  # there must be something to take the place of rows
     # Flat first: a mask that leaves a whole block of texts without one makes tensordict stumble over the empty stack.
-    decisions = wave.select(*in_keys, *learned).reshape(-1)[chosen]
+    decisions = wave.select(*in_keys, *learned, *held).reshape(-1)[chosen]
     decisions = to_device(decisions, device_of(learner.part))
     decisions[keys.STEP_MASK] = decisions["next", keys.STEP_MASK]
     decisions.set(keys.INSTRUCTION, row_texts(instructions_of(decisions)))  # cheap to index, minibatch by minibatch
@@ -121,11 +124,11 @@ def _backward(
         part["total_steps"] = total_steps.expand(len(part), 1)
         with learner.accumulating(last=turn + 1 == turns):
             out = learner(part)
-            learner.backward_sum(out["loss_objective"])
+            learner.backward_sum(sum(value for name, value in out.items() if name.startswith("loss_")))
         names = [name for name, value in out.items() if value.numel() == 1]
         share, *values = torch.stack([part[keys.STEP_MASK].sum() / steps, *(out[name] for name in names)]).tolist()
         for name, value in zip(names, values, strict=True):
-            weight = 1.0 if name == "loss_objective" else share
+            weight = 1.0 if name.startswith("loss_") else share
             figures[name] = figures.get(name, 0.0) + weight * value
     sums = processes.total(torch.tensor([*figures.values()], dtype=torch.float64))
     return dict(zip(figures, sums.tolist(), strict=True))

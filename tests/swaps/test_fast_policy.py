@@ -16,7 +16,7 @@ from policies.lerobot_fast_folder import save_fast_folder
 from safetensors.torch import load_file
 from transformers import AutoModelForImageTextToText
 
-from checks import check_ratio_level
+from checks import check_loop
 from config import RealSize
 from parts import COMPACT
 from published_sizes import outlined_policy
@@ -129,7 +129,7 @@ def test_a_decision_of_whole_chunks_is_planned(tiny, folder, published):
 def test_a_ratio_of_steps_is_refused_before_long_work(tiny, folder):
     config = real(tiny, folder, level="step")
     with pytest.raises(ValueError, match=r"ratio_level must be chunk or token for FASTPolicy, .* got 'step'"):
-        check_ratio_level(config, REAL_SIZE.policy.outline(config))
+        check_loop(config, REAL_SIZE.policy.outline(config))
 
 
 def test_lerobots_pi0_fast_is_known_by_its_files(tiny, tmp_path):

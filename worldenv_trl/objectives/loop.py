@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -45,6 +44,15 @@ class LOOPLoss(LossModule):
     The step mask is an outcome of the decision: it is read below ``"next"`` where it exists there, as in every rollout
     (whose root entry belongs to the decision before), and at the root otherwise.
 
+    With ``hold_coef``, ``held`` bool [*B, 1], ``("reference", "loc")`` and ``("reference", "scale")`` [*B, C, 7] are
+    read, too, and ``loss_hold`` (scalar) is to be added,
+
+    .. math:: L_{hold} = \frac{c}{\sum_n T_n} \sum_{n, t\;held} \frac{1}{7} \sum_d
+        \frac{|\mu_{t,d} - \mu^{ref}_{t,d}|}{b^{ref}_{t,d}},
+
+    which keeps the mean of an actor with a location (Laplace) where a reference policy has it. What returns do not
+    show, noise gets past: a policy that samples as well as before may have lost what it does greedily.
+
     Returns ``loss_objective`` (scalar), and detached ``kl_approx`` (mean of ``(r - 1) - log r`` per step),
     ``clip_fraction``, ``ESS`` (effective sample size as a share of the steps).
 
@@ -63,6 +71,7 @@ class LOOPLoss(LossModule):
         normalize: ``global`` (the paper) weighs every step equally, ``episode`` every rollout. The latter reads
             ``total_steps`` and the number of rollouts ``num_rollouts`` [*B, 1], or counts both if decisions are
             ``[*rollouts, T]``, time last.
+        hold_coef: ``c`` above, at least 0; at 0 nothing is held.
         functional: False keeps the actor's parameters in the actor (needed for adapters injected by peft, and FSDP).
 
     Raises:
@@ -110,13 +119,15 @@ class LOOPLoss(LossModule):
         mask: NestedKey = keys.MASK
         total_steps: NestedKey = "total_steps"
         num_rollouts: NestedKey = "num_rollouts"
+        held: NestedKey = keys.HELD
+        reference_loc: NestedKey = keys.REFERENCE_LOC
+        reference_scale: NestedKey = keys.REFERENCE_SCALE
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     actor_network: ProbabilisticTensorDictSequential
     actor_network_params: TensorDictParams | None
     target_actor_network_params: TensorDictParams | None
-    out_keys: ClassVar[list[str]] = ["loss_objective", "kl_approx", "clip_fraction", "ESS"]
 
     def __init__(
         self,
@@ -125,12 +136,15 @@ class LOOPLoss(LossModule):
         clip_epsilon: float | tuple[float, float] = 0.1,
         ratio_level: str = "step",
         normalize: str = "global",
+        hold_coef: float = 0.0,
         functional: bool = True,
     ) -> None:
         if ratio_level not in RATIO_LEVELS:
             raise ValueError(f"ratio_level must be one of {', '.join(RATIO_LEVELS)}, got {ratio_level!r}")
         if normalize not in NORMALIZATIONS:
             raise ValueError(f"normalize must be one of {', '.join(NORMALIZATIONS)}, got {normalize!r}")
+        if not 0 <= hold_coef < math.inf:
+            raise ValueError(f"hold_coef must be at least 0 and finite, got {hold_coef}")
         self._functional = functional
         super().__init__()
         if functional:
@@ -138,7 +152,7 @@ class LOOPLoss(LossModule):
         else:
             self.actor_network, self.actor_network_params = actor, None
         self.ratio_level, self.normalize = ratio_level, normalize
-        self.clip_epsilon = clip_epsilon
+        self.clip_epsilon, self.hold_coef = clip_epsilon, float(hold_coef)
 
     @property
     def functional(self) -> bool:
@@ -164,13 +178,18 @@ class LOOPLoss(LossModule):
         names = self.tensor_keys
         own = [names.action, names.sample_log_prob, names.advantage, names.step_mask]
         own += [names.token_is_pad] if names.token_is_pad in self.actor_network.out_keys else []
+        own += [names.held, names.reference_loc, names.reference_scale] if self.hold_coef else []
         return [*own, *(key for key in self.actor_network.in_keys if key not in own)]
+
+    @property
+    def out_keys(self) -> list[str]:
+        return ["loss_objective", *(["loss_hold"] if self.hold_coef else []), "kl_approx", "clip_fraction", "ESS"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = tensordict.copy()
         steps = self._executed(tensordict)
-        log_ratio, mask, advantage = self._compared(tensordict, steps)
+        distribution, log_ratio, mask, advantage = self._compared(tensordict, steps)
         # min(r A, clip(r) A) is 0 for A = 0; taken out because a ratio that overflows would make it inf * 0.
         ratio = torch.where(mask & (advantage != 0), log_ratio, 0.0).exp()
         low, high = self.clip_epsilon
@@ -181,8 +200,11 @@ class LOOPLoss(LossModule):
                 gain = gain.sum(-1, keepdim=True) / mask.sum(-1, keepdim=True).clamp_min(1) * steps
             else:
                 gain = gain.mean(-1)
-        loss = -(gain * self._weight(tensordict, steps, gain.dtype)).sum()
-        return TensorDict({"loss_objective": loss} | self._diagnostics(log_ratio.detach(), mask))
+        weight = self._weight(tensordict, steps, gain.dtype)
+        out = {"loss_objective": -(gain * weight).sum()}
+        if self.hold_coef:
+            out["loss_hold"] = self.hold_coef * (self._away(tensordict, distribution, steps) * weight).sum()
+        return TensorDict(out | self._diagnostics(log_ratio.detach(), mask))
 
     @torch.no_grad()
     def ratios(self, tensordict: TensorDictBase) -> TensorDict:
@@ -195,14 +217,30 @@ class LOOPLoss(LossModule):
             chunks, [*B, L], for ``token``.
         """
         tensordict = tensordict.copy()  # the actor writes into it
-        log_ratio, mask, advantage = self._compared(tensordict, self._executed(tensordict))
+        _, log_ratio, mask, advantage = self._compared(tensordict, self._executed(tensordict))
         ratio = torch.where(mask, log_ratio, 0.0).exp()
         low, high = self.clip_epsilon
         clipped = ((ratio > 1 + high) & (advantage > 0)) | ((ratio < 1 - low) & (advantage < 0))
         return TensorDict({keys.RATIO: ratio, keys.CLIPPED: clipped & mask}, tensordict.batch_size)
 
-    def _compared(self, tensordict: TensorDictBase, steps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Log-ratios of the executed steps [*B, C], where they hold, and the advantage; see :meth:`_log_ratio`."""
+    def _away(self, tensordict: TensorDictBase, distribution: Distribution, steps: Tensor) -> Tensor:
+        """[*B, C], how far the mean is from the reference's at executed steps of held decisions, in its scale."""
+        names = self.tensor_keys
+        held = tensordict.get(names.held, None)
+        loc, scale = (tensordict.get(name, None) for name in (names.reference_loc, names.reference_scale))
+        if held is None or loc is None or scale is None:
+            raise ValueError(
+                f"hold_coef needs {names.held!r} {[*steps.shape[:-1], 1]}, {names.reference_loc!r} and "
+                f"{names.reference_scale!r}, the reference's at each decision: write them, or pass hold_coef=0"
+            )
+        mean = getattr(distribution, "loc", None)
+        if mean is None:
+            raise ValueError(f"hold_coef needs an actor with a location, got {type(distribution).__name__}")
+        return torch.where(steps & held, ((mean - loc).abs() / scale).mean(-1), 0.0)
+
+    def _compared(self, tensordict: TensorDictBase, steps: Tensor) -> tuple[Distribution, Tensor, Tensor, Tensor]:
+        """What the actor says now, log-ratios of the executed steps [*B, C], where they hold, and the advantage; see
+        :meth:`_log_ratio`."""
         names = self.tensor_keys
         chunk, before = tensordict.get(names.action), tensordict.get(names.sample_log_prob)
         if before.requires_grad:
@@ -225,15 +263,16 @@ class LOOPLoss(LossModule):
         executed = steps.any(-1, keepdim=True) if whole else steps.unsqueeze(-1)
         chunk = torch.where(executed, chunk, torch.zeros_like(chunk))  # tokens stay whole numbers
         tensordict.set(names.action, chunk)  # an autoregressive actor reads them
-        now = self._distribution(tensordict).log_prob(chunk)
+        distribution = self._distribution(tensordict)
+        now = distribution.log_prob(chunk)
         if now.shape != before.shape:
             raise ValueError(
                 f"{names.sample_log_prob} is {list(before.shape)}, the actor scores {list(now.shape)}: "
                 "collect and train with the same event_dims"
             )
         if whole:
-            return self._whole_log_ratio(now - before, executed & ~padding, steps, advantage)
-        return self._log_ratio(now - before, steps, advantage)
+            return distribution, *self._whole_log_ratio(now - before, executed & ~padding, steps, advantage)
+        return distribution, *self._log_ratio(now - before, steps, advantage)
 
     def _whole_log_ratio(
         self, difference: Tensor, said: Tensor, steps: Tensor, advantage: Tensor
