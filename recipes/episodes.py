@@ -18,6 +18,11 @@ def demonstrations(run: Run) -> Episodes:
     return episodes_from_rollouts(read_rollouts(run.folder.require_rollouts("demonstrations", "demonstrate")))
 
 
+def round_of(suffix: str) -> int:
+    """The number of the round whose models have this suffix."""
+    return int(suffix.removeprefix("_") or 1)
+
+
 def demonstrations_and_exploration(run: Run, rounds: int) -> tuple[Episodes, Episodes]:
     """Demonstrations, and the exploration of the first ``rounds`` rounds; frames stay on disk, in ``episodes/``."""
     demonstrated, *explored = recorded_episodes(run, rounds)

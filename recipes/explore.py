@@ -89,5 +89,12 @@ def own_episodes(settings: Explore, tasks: int) -> int:
     return waves_per_scale(settings, tasks) * len(settings.scale_factors) * settings.num_envs
 
 
+def rows_of_scale(settings: Explore, tasks: int, factor: float) -> slice:
+    """Which episodes of a round's recording were sampled at ``factor`` times the scale."""
+    count = waves_per_scale(settings, tasks) * settings.num_envs
+    begin = settings.scale_factors.index(factor) * count
+    return slice(begin, begin + count)
+
+
 if __name__ == "__main__":
     run_alone("explore", explore)

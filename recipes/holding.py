@@ -15,16 +15,13 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from episodes import recorded_episodes
-from explore import waves_per_scale
+from episodes import recorded_episodes, round_of
+from explore import rows_of_scale
 from physics import exploring_actor
 from run import Run
-from updates import rows_at_once
+from updates import rows_of
 from worldenv_trl import keys
 from worldenv_trl.data import Episodes
-from worldenv_trl.devices import device_of, to_device
-from worldenv_trl.language import instructions_of
-from worldenv_trl.row_texts import row_texts
 
 
 class Hold:
@@ -38,7 +35,7 @@ class Hold:
     def __init__(self, run: Run, source: str, models: str) -> None:
         policy = run.policy(source).eval()
         self._actor = exploring_actor(run.config, policy, run.config.post_train.scale_factor)
-        shares = solved_shares(greedy_exploration(run, int(models.removeprefix("_") or 1)))
+        shares = solved_shares(greedy_exploration(run, round_of(models)))
         self._tasks = torch.tensor(
             [task for task, share in shares.items() if share >= run.config.post_train.hold_from], dtype=torch.long
         )
@@ -55,33 +52,21 @@ class Hold:
         return torch.isin(tasks, self._tasks.to(tasks.device))
 
     @torch.no_grad()
-    def refer(self, wave: TensorDictBase, held: Tensor) -> None:
-        """Writes ``held`` and the reference into a wave [G, N, T] of whose groups ``held`` [G] are held."""
-        policy, device = self._actor.policy, wave[keys.CHUNK].device
-        rows = (wave[keys.MASK] & held[:, None, None]).flatten()
-        wave[keys.HELD] = rows.view(*wave.shape, 1)
-        found = {keys.REFERENCE_LOC: torch.zeros_like(wave[keys.CHUNK]).flatten(0, 2)}
-        found[keys.REFERENCE_SCALE] = torch.ones_like(found[keys.REFERENCE_LOC])
-        decisions = wave.select(*policy.in_keys).reshape(-1)[rows]
-        if len(decisions):
-            decisions.set(keys.INSTRUCTION, row_texts(instructions_of(decisions)))
-            pixels = sum(value[0].numel() for value in decisions["observation"].values() if value.dtype == torch.uint8)
-            parts: list[Any] = [
-                self._actor.get_dist(to_device(part, device_of(policy)))
-                for part in decisions.split(rows_at_once(pixels, device_of(policy).type))
-            ]
-            found[keys.REFERENCE_LOC][rows] = torch.cat([part.loc for part in parts]).to(device)
-            found[keys.REFERENCE_SCALE][rows] = torch.cat([part.scale for part in parts]).to(device)
-        for key, value in found.items():
-            wave[key] = value.view_as(wave[keys.CHUNK])
+    def refer(self, decisions: TensorDictBase) -> None:
+        """Writes the reference's ``loc`` and ``scale`` [M, C, 7] into decisions [M], zeros and ones where not held."""
+        held = decisions[keys.HELD].squeeze(-1).nonzero().squeeze(-1)
+        loc = torch.zeros_like(decisions[keys.CHUNK])
+        scale = torch.ones_like(loc)
+        for rows in held.split(rows_of(decisions)) if len(held) else ():
+            found: Any = self._actor.get_dist(decisions[rows].select(*self._actor.policy.in_keys))
+            loc[rows], scale[rows] = found.loc, found.scale
+        decisions[keys.REFERENCE_LOC], decisions[keys.REFERENCE_SCALE] = loc, scale
 
 
 def greedy_exploration(run: Run, number: int) -> Episodes:
     """Exploration's rollouts without noise, of round ``number``."""
-    settings = run.config.explore
-    count = waves_per_scale(settings, len(run.config.tasks)) * settings.num_envs
-    begin = count * settings.scale_factors.index(0.0)
-    return recorded_episodes(run, number)[-1][begin : begin + count]
+    rows = rows_of_scale(run.config.explore, len(run.config.tasks), 0.0)
+    return recorded_episodes(run, number)[-1][rows]
 
 
 def solved_shares(episodes: Episodes) -> dict[int, float]:

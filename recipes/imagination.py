@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
-from episodes import demonstrations_and_exploration
+from episodes import demonstrations_and_exploration, round_of
 from parts import PROPRIO
 from run import Run
 from worldenv_trl import keys
@@ -38,7 +38,7 @@ class Imagination:
     def load(cls, run: Run, suffix: str) -> Imagination:
         """That of a round."""
         world_model = run.world_model(suffix)
-        _, explored = demonstrations_and_exploration(run, rounds=int(suffix.removeprefix("_") or 1))
+        _, explored = demonstrations_and_exploration(run, rounds=round_of(suffix))
         contexts = contexts_of(explored, world_model.cameras)
         rule = run.rules(suffix)["imagined"]
         judge = run.reflector(suffix).for_world("imagined")

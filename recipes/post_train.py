@@ -72,8 +72,13 @@ def post_train(
 
     def make_loss(part: Policy) -> LOOPLoss:
         scored = actor if part is policy else exploring_actor(config, part, settings.scale_factor)
-        options: dict[str, Any] = {"ratio_level": settings.ratio_level, "hold_coef": settings.hold}
-        loss = LOOPLoss(scored, clip_epsilon=settings.clip_epsilon, functional=False, **options)
+        loss = LOOPLoss(
+            scored,
+            clip_epsilon=settings.clip_epsilon,
+            ratio_level=settings.ratio_level,
+            reference_coef=settings.hold,
+            functional=False,
+        )
         if isinstance(part, TokenPolicy):
             loss.set_keys(action=keys.TOKENS)
         return loss
@@ -112,16 +117,17 @@ def post_train(
         advantage = rloo_advantage(returns)
         if settings.standardize:
             advantage = advantage / advantage.std().clamp_min(1e-6)
-        held = None
         if hold is not None:
-            held = processes.gathered(hold.groups(mine))
+            own = hold.groups(mine)
+            held = processes.gathered(own)
             advantage = advantage * ~held[:, None]
-            hold.refer(mine, processes.own_rows_of(held))
+            mine[keys.HELD] = _at_decisions(own[:, None], mine)
         mine[keys.ADVANTAGE] = _at_decisions(processes.own_rows_of(advantage), mine)
         about = {}
         if iteration in recorded and processes.is_main():  # of the weights that collected it
             about = recording(config, waves.env, target, {"policy": policy} | waves.judges, iteration=iteration)
-        metrics = update(mine, read, learner, optimizer, list(groups.values()), settings)
+        refer = None if hold is None else hold.refer
+        metrics = update(mine, read, learner, optimizer, list(groups.values()), settings, refer)
         learner.gather()
         counts["stuck"] = stuck(counts["stuck"], metrics)
         if counts["stuck"] == PATIENCE and processes.is_main():
@@ -135,7 +141,7 @@ def post_train(
         waves.update_policy_weights_()
 
         metrics |= _wave_metrics(mine, returns, config.tasks)
-        if held is not None:
+        if hold is not None:
             metrics["held_groups"] = held.float().mean().item()
         metrics["iteration_seconds"], started = time.monotonic() - started, time.monotonic()
         if iteration in probed:
@@ -157,7 +163,7 @@ def post_train(
 
 
 def _at_decisions(advantage: torch.Tensor, wave: TensorDictBase) -> torch.Tensor:
-    """[G, N, T, 1] of advantages [G, N]: the same at every decision."""
+    """[G, N, T, 1] of advantages [G, N], or of something of each group [G, 1]: the same at every decision."""
     return advantage[..., None, None].expand(*wave.shape, 1)
 
 

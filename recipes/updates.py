@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -41,6 +41,7 @@ def update(
     optimizer: torch.optim.Optimizer,
     parameter_groups: Sequence[list[torch.nn.Parameter]],
     settings: PostTrain,
+    refer: Callable[[TensorDictBase], None] | None = None,
 ) -> dict[str, float]:
     """K epochs of clipped updates on the decisions of a wave, stopped when the policy has moved too far.
 
@@ -49,27 +50,31 @@ def update(
             processes each has groups of its own, and a minibatch is theirs together.
         in_keys: what the policy reads, and the tokens of one that acts by tokens.
         learner: of a :class:`LOOPLoss`, whose minibatches add up.
+        refer: writes what a reference policy does at the decisions ``[M]`` that are learned from, of a wave that says
+            which are held.
 
     Decisions that have no advantage and are not held teach nothing and are left out, but count among Eq. 5's steps. If
     there is no other one, nothing moves: the optimiser's moments alone would.
     """
     mask = wave[keys.MASK]
     informative = mask & (wave[keys.ADVANTAGE].squeeze(-1) != 0)
-    held = [key for key in (keys.HELD, keys.REFERENCE_LOC, keys.REFERENCE_SCALE) if wave.get(key, None) is not None]
-    if held:
+    if refer is not None:
         informative |= mask & wave[keys.HELD].squeeze(-1)
     counts = processes.gathered_values(int(informative.sum()))
     if not any(counts):
         return {"updates": 0, "kl_stop": 0.0}
-    learned = (keys.CHUNK, keys.LOG_PROBS, keys.ADVANTAGE, ("next", keys.STEP_MASK), keys.MASK)
+    learned: list[NestedKey] = [keys.CHUNK, keys.LOG_PROBS, keys.ADVANTAGE, ("next", keys.STEP_MASK), keys.MASK]
+    learned += [] if refer is None else [keys.HELD]
     chosen = informative.flatten()
     if not counts[processes.rank()]:
         chosen = torch.arange(1)  # there must be something to take the place of rows
     # Flat first: a mask that leaves a whole block of texts without one makes tensordict stumble over the empty stack.
-    decisions = wave.select(*in_keys, *learned, *held).reshape(-1)[chosen]
+    decisions = wave.select(*in_keys, *learned).reshape(-1)[chosen]
     decisions = to_device(decisions, device_of(learner.part))
     decisions[keys.STEP_MASK] = decisions["next", keys.STEP_MASK]
     decisions.set(keys.INSTRUCTION, row_texts(instructions_of(decisions)))  # cheap to index, minibatch by minibatch
+    if refer is not None:
+        refer(decisions)
     total_steps = (wave["next", keys.STEP_MASK] & mask.unsqueeze(-1)).sum().to(decisions[keys.CHUNK].device)
     total_steps = processes.total(total_steps)
     sums: dict[str, float] = {}
@@ -112,8 +117,7 @@ def _backward(
         shares: rows of the minibatch, of the decisions of each process.
         total_steps: that the minibatch stands for.
     """
-    pixels = sum(value[0].numel() for value in decisions["observation"].values() if value.dtype == torch.uint8)
-    at_once = rows_at_once(pixels, decisions[keys.CHUNK].device.type)
+    at_once = rows_of(decisions)
     parts = list(shares[processes.rank()].split(at_once))
     # All take as many turns: gradients are exchanged in them.
     turns = max(-(-len(share) // at_once) for share in shares)
@@ -142,6 +146,12 @@ def _part(decisions: TensorDictBase, rows: torch.Tensor) -> TensorDictBase:
     blank[keys.STEP_MASK] = torch.zeros_like(blank[keys.STEP_MASK])
     blank["next", keys.STEP_MASK] = blank[keys.STEP_MASK]
     return blank
+
+
+def rows_of(decisions: TensorDictBase) -> int:
+    """:func:`rows_at_once` of decisions [M] on their device."""
+    pixels = sum(value[0].numel() for value in decisions["observation"].values() if value.dtype == torch.uint8)
+    return rows_at_once(pixels, decisions[keys.CHUNK].device.type)
 
 
 def rows_at_once(pixels: int, device_type: str) -> int:

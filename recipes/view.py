@@ -57,8 +57,7 @@ def _rerun(options: Options) -> int:
     if options.save is None and not has_display():
         raise OSError("there is no display to open a window on: pass --save rollouts.rrd and open that elsewhere")
     recording = rerun_recording(options.file, options.rollout or slice(MOST))
-    count = len(list_rollouts(options.file))
-    if not options.rollout and count > MOST:
+    if not options.rollout and (count := len(list_rollouts(options.file))) > MOST:
         print(f"the first {MOST} of {count} rollouts: name others with --rollout")
     if options.save is None:
         recording.spawn()

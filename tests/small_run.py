@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
+import torch
+
 import config
+from parts import COMPACT
+from run import Run
+from stages import open_run
 
 SMALL = dataclasses.replace(
     config.PRESETS["smoke"][1],
@@ -20,3 +25,11 @@ SMALL = dataclasses.replace(
     post_train=config.PostTrain(iterations=1, groups=2, group_size=2, epochs=1, probe_contexts=2),
     evaluate=config.Evaluate(episodes_per_task=2, num_envs=2),
 )
+
+
+def with_untrained_policy(settings: config.WorldEnvConfig) -> Run:
+    """A run whose fine-tuned policy is as it was made."""
+    run = open_run(settings)
+    torch.manual_seed(0)
+    COMPACT.policy.make(run.config).save_pretrained(run.folder.checkpoint("sft"))
+    return run

@@ -360,7 +360,7 @@ def test_settings_that_cannot_work_are_named():
 @pytest.mark.parametrize("normalize", ["global", "episode"])
 def test_what_is_held_costs_its_distance_in_units_of_the_references_scale(functional, normalize):
     actor, batch = make_actor(), make_batch()
-    loss = LOOPLoss(actor, hold_coef=3.0, normalize=normalize, functional=functional)
+    loss = LOOPLoss(actor, reference_coef=3.0, normalize=normalize, functional=functional)
     free = value_and_gradient(actor, LOOPLoss(actor, normalize=normalize, functional=functional), batch)
     generator = torch.Generator().manual_seed(3)
     held = torch.rand(G, N, T, 1, generator=generator) < 0.5
@@ -383,15 +383,15 @@ def test_what_is_held_costs_its_distance_in_units_of_the_references_scale(functi
 
     expected = value_and_gradient(actor, written_out, batch)
     assert expected[0] > 0.1
-    assert_same(value_and_gradient(actor, lambda td: {"loss_objective": loss(td)["loss_hold"]}, batch), expected)
+    assert_same(value_and_gradient(actor, lambda td: {"loss_objective": loss(td)["loss_reference"]}, batch), expected)
     assert_same(value_and_gradient(actor, loss, batch), free)
-    assert set(loss(batch).keys()) == set(loss.out_keys) and "loss_hold" in loss.out_keys
+    assert set(loss(batch).keys()) == set(loss.out_keys) and "loss_reference" in loss.out_keys
 
 
 def test_a_reference_that_lacks_is_named():
-    loss, batch = LOOPLoss(make_actor(), hold_coef=1.0), make_batch()
-    with pytest.raises(ValueError, match=r"hold_coef needs 'held' \[2, 3, 3, 1\]"):
+    loss, batch = LOOPLoss(make_actor(), reference_coef=1.0), make_batch()
+    with pytest.raises(ValueError, match=r"reference_coef needs 'held' \[2, 3, 3, 1\]"):
         loss(batch)
     for value in (-1.0, math.nan, math.inf):
-        with pytest.raises(ValueError, match="hold_coef must be at least 0"):
-            LOOPLoss(make_actor(), hold_coef=value)
+        with pytest.raises(ValueError, match="reference_coef must be at least 0"):
+            LOOPLoss(make_actor(), reference_coef=value)

@@ -15,6 +15,7 @@ from uuid import uuid4
 import pytest
 import torch
 from safetensors.torch import load_file
+from small_run import with_untrained_policy
 from tensordict import TensorDict
 
 import imagination
@@ -127,9 +128,7 @@ def run(tiny):
     learned = dataclasses.replace(tiny.post_train, iterations=2, groups=3, env="tabletop", probe_every=0)
     evaluated = dataclasses.replace(tiny.evaluate, episodes_per_task=3, num_envs=3)
     settings = {"collectors": "process:1/3", "post_train": learned, "evaluate": evaluated}
-    run = open_run(dataclasses.replace(tiny, **settings))
-    torch.manual_seed(0)
-    COMPACT.policy.make(run.config).save_pretrained(run.folder.checkpoint("sft"))
+    run = with_untrained_policy(dataclasses.replace(tiny, **settings))
     yield run
     run.close()
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 import torch
-from small_run import SMALL
+from small_run import SMALL, with_untrained_policy
 from tensordict import TensorDict
 
 import config
@@ -15,11 +15,9 @@ from checks import check_config, check_loop
 from demonstrate import demonstrate
 from explore import explore
 from holding import Hold, greedy_exploration, solved_shares
-from parts import COMPACT
 from physics import exploring_actor, reached_goal
 from post_train import post_train
 from run import Run
-from stages import open_run
 from worldenv_trl import keys
 from worldenv_trl.policies import TokenPolicy
 from worldenv_trl.record import read_rollouts
@@ -39,8 +37,8 @@ def test_a_share_is_of_all_rollouts_of_a_task():
 
 @pytest.fixture(scope="module")
 def explored(tmp_path_factory):
-    """Demonstrations, and an exploration whose second scale is greedy."""
-    run = open_run(
+    """An exploration whose second scale is greedy, and the demonstrations that are stored with it."""
+    run = with_untrained_policy(
         dataclasses.replace(
             SMALL,
             run_dir=tmp_path_factory.mktemp("holding") / "run",
@@ -49,8 +47,6 @@ def explored(tmp_path_factory):
         )
     )
     demonstrate(run)
-    torch.manual_seed(0)
-    COMPACT.policy.make(run.config).save_pretrained(run.folder.checkpoint("sft"))
     explore(run)
     yield run
     run.close()
@@ -89,10 +85,7 @@ def test_what_cannot_be_held_is_refused_before_any_work():
 def physics(tiny):
     """A run of LOOP in the physics, two groups of two an iteration, from an untrained policy."""
     learned = dataclasses.replace(tiny.post_train, iterations=2, env="tabletop", probe_every=0, lora_rank=0)
-    run = open_run(dataclasses.replace(tiny, post_train=learned))
-    torch.manual_seed(0)
-    COMPACT.policy.make(run.config).save_pretrained(run.folder.checkpoint("sft"))
-    return run
+    return with_untrained_policy(dataclasses.replace(tiny, post_train=learned))
 
 
 def learned(run, monkeypatch, weight, solved):
@@ -124,21 +117,19 @@ def test_a_task_that_is_held_stays_and_one_that_is_not_is_learned_as_without(phy
 def test_the_reference_is_what_the_source_does_at_held_decisions_alone(physics, monkeypatch):
     monkeypatch.setattr(holding, "greedy_exploration", lambda *_: episodes([4, 5], [0, 1]))
     hold = Hold(physics, "sft", "")
-    actor = exploring_actor(physics.config, physics.policy("sft").eval(), 1.0)
+    wave = TensorDict({keys.TASK_ID: torch.tensor([4, 5]).view(2, 1, 1, 1).expand(2, 3, 4, 1)}, [2, 3, 4])
+    assert hold.groups(wave).tolist() == [False, True]
     size = physics.config.image_size
-    images = torch.randint(0, 255, (2, 3, 4, 3, size, size), dtype=torch.uint8)
-    state = torch.rand(2, 3, 4, 7)
-    wave = TensorDict({"observation": {"image": images, "state": state}}, [2, 3, 4])
-    wave.set(keys.INSTRUCTION, "open the top drawer")
+    images = torch.randint(0, 255, (6, 3, size, size), dtype=torch.uint8)
+    decisions = TensorDict({"observation": {"image": images, "state": torch.rand(6, 7)}}, [6])
+    decisions.set(keys.INSTRUCTION, "open the top drawer")
+    decisions[keys.CHUNK] = torch.zeros(6, 8, 7)
+    held = torch.tensor([True, False, True, False, False, True])
+    decisions[keys.HELD] = held[:, None]
     with torch.no_grad():
-        expected = actor.get_dist(wave.reshape(-1))
-    wave[keys.CHUNK] = torch.zeros(2, 3, 4, 8, 7)
-    wave[keys.TASK_ID] = torch.tensor([4, 5]).view(2, 1, 1, 1).expand(2, 3, 4, 1)
-    wave[keys.MASK] = torch.arange(4).expand(2, 3, 4) < 3
-    held = hold.groups(wave)
-    assert held.tolist() == [False, True]
-    hold.refer(wave, held)
-    rows = wave[keys.HELD].squeeze(-1)
-    assert rows[0].sum() == 0 and rows[1].sum() == 9
-    torch.testing.assert_close(wave[keys.REFERENCE_LOC][rows], expected.loc.view(2, 3, 4, 8, 7)[rows])
-    torch.testing.assert_close(wave[keys.REFERENCE_SCALE][rows], expected.scale.view(2, 3, 4, 8, 7)[rows])
+        expected = exploring_actor(physics.config, physics.policy("sft").eval(), 1.0).get_dist(decisions.clone())
+    monkeypatch.setattr(holding, "rows_of", lambda _: 2)  # the last one alone
+    hold.refer(decisions)
+    torch.testing.assert_close(decisions[keys.REFERENCE_LOC][held], expected.loc[held])
+    torch.testing.assert_close(decisions[keys.REFERENCE_SCALE][held], expected.scale[held])
+    assert (decisions[keys.REFERENCE_LOC][~held] == 0).all() and (decisions[keys.REFERENCE_SCALE][~held] == 1).all()

@@ -7,6 +7,7 @@ import dataclasses
 
 import pytest
 import torch
+from small_run import with_untrained_policy
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -14,12 +15,10 @@ import probes
 import updates
 from config import PRESETS, PostTrain
 from data_parallel import DataParallel
-from parts import COMPACT
 from physics import exploring_actor
 from post_train import post_train
 from run import Run
 from run_folder import RunFolder
-from stages import open_run
 from updates import STUCK, stuck, update
 from worldenv_trl import keys
 from worldenv_trl.metrics import HonestyAlarm
@@ -55,10 +54,7 @@ def test_without_a_world_model_there_is_nothing_to_distrust(monkeypatch, tmp_pat
 def physics(tiny):
     """A run of LOOP in the physics, two groups of two an iteration, from an untrained policy."""
     learned = dataclasses.replace(tiny.post_train, iterations=4, env="tabletop", probe_every=0)
-    run = open_run(dataclasses.replace(tiny, post_train=learned))
-    torch.manual_seed(0)
-    COMPACT.policy.make(run.config).save_pretrained(run.folder.checkpoint("sft"))
-    return run
+    return with_untrained_policy(dataclasses.replace(tiny, post_train=learned))
 
 
 def test_contexts_come_in_shuffled_passes(physics):

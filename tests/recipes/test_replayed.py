@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 import torch
-from small_run import SMALL
+from small_run import SMALL, with_untrained_policy
 from tensordict import TensorDict
 from test_resumed_recordings import Interrupted, interrupt, result
 
@@ -15,10 +15,9 @@ import explore as explore_stage
 import replayed
 from demonstrate import demonstrate
 from explore import explore, own_episodes, waves_per_scale
-from parts import COMPACT
 from replayed import MOVED_IN, Successes, moved_aside, replays_per_task
 from stage_plan import explored
-from stages import open_run, rerun
+from stages import rerun
 from worldenv_trl import keys
 from worldenv_trl.data import episodes_from_rollouts
 from worldenv_trl.record import read_rollouts
@@ -30,7 +29,7 @@ SHIFT = 0.04
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """Demonstrations of two tasks, and an untrained policy, which succeeds at nothing."""
-    run = open_run(
+    run = with_untrained_policy(
         dataclasses.replace(
             SMALL,
             run_dir=tmp_path_factory.mktemp("replayed") / "run",
@@ -44,8 +43,6 @@ def run(tmp_path_factory):
         )
     )
     demonstrate(run)
-    torch.manual_seed(0)
-    COMPACT.policy.make(run.config).save_pretrained(run.folder.checkpoint("sft"))
     yield run
     run.close()
 

@@ -44,14 +44,15 @@ class LOOPLoss(LossModule):
     The step mask is an outcome of the decision: it is read below ``"next"`` where it exists there, as in every rollout
     (whose root entry belongs to the decision before), and at the root otherwise.
 
-    With ``hold_coef``, ``held`` bool [*B, 1], ``("reference", "loc")`` and ``("reference", "scale")`` [*B, C, 7] are
-    read, too, and ``loss_hold`` (scalar) is to be added,
+    With ``reference_coef``, also ``held`` bool [*B, 1], ``("reference", "loc")`` and ``("reference", "scale")``
+    [*B, C, 7] are read, and ``loss_reference`` (scalar) is to be added,
 
-    .. math:: L_{hold} = \frac{c}{\sum_n T_n} \sum_{n, t\;held} \frac{1}{7} \sum_d
+    .. math:: L_{ref} = \frac{c}{\sum_n T_n} \sum_{n, t\;held} \frac{1}{7} \sum_d
         \frac{|\mu_{t,d} - \mu^{ref}_{t,d}|}{b^{ref}_{t,d}},
 
-    which keeps the mean of an actor with a location (Laplace) where a reference policy has it. What returns do not
-    show, noise gets past: a policy that samples as well as before may have lost what it does greedily.
+    which keeps the mean of an actor with a location (Laplace) where a reference policy has it. World-Env has no such
+    term; GRPO (DeepSeekMath, arXiv 2402.03300, Eq. 3) has one everywhere, a divergence of what is sampled. This one is
+    of the mean, which the greedy policy takes and sampled returns hardly show.
 
     Returns ``loss_objective`` (scalar), and detached ``kl_approx`` (mean of ``(r - 1) - log r`` per step),
     ``clip_fraction``, ``ESS`` (effective sample size as a share of the steps).
@@ -71,7 +72,7 @@ class LOOPLoss(LossModule):
         normalize: ``global`` (the paper) weighs every step equally, ``episode`` every rollout. The latter reads
             ``total_steps`` and the number of rollouts ``num_rollouts`` [*B, 1], or counts both if decisions are
             ``[*rollouts, T]``, time last.
-        hold_coef: ``c`` above, at least 0; at 0 nothing is held.
+        reference_coef: ``c`` above, at least 0; at 0 nothing is held.
         functional: False keeps the actor's parameters in the actor (needed for adapters injected by peft, and FSDP).
 
     Raises:
@@ -136,15 +137,15 @@ class LOOPLoss(LossModule):
         clip_epsilon: float | tuple[float, float] = 0.1,
         ratio_level: str = "step",
         normalize: str = "global",
-        hold_coef: float = 0.0,
+        reference_coef: float = 0.0,
         functional: bool = True,
     ) -> None:
         if ratio_level not in RATIO_LEVELS:
             raise ValueError(f"ratio_level must be one of {', '.join(RATIO_LEVELS)}, got {ratio_level!r}")
         if normalize not in NORMALIZATIONS:
             raise ValueError(f"normalize must be one of {', '.join(NORMALIZATIONS)}, got {normalize!r}")
-        if not 0 <= hold_coef < math.inf:
-            raise ValueError(f"hold_coef must be at least 0 and finite, got {hold_coef}")
+        if not 0 <= reference_coef < math.inf:
+            raise ValueError(f"reference_coef must be at least 0 and finite, got {reference_coef}")
         self._functional = functional
         super().__init__()
         if functional:
@@ -152,7 +153,7 @@ class LOOPLoss(LossModule):
         else:
             self.actor_network, self.actor_network_params = actor, None
         self.ratio_level, self.normalize = ratio_level, normalize
-        self.clip_epsilon, self.hold_coef = clip_epsilon, float(hold_coef)
+        self.clip_epsilon, self.reference_coef = clip_epsilon, float(reference_coef)
 
     @property
     def functional(self) -> bool:
@@ -178,12 +179,18 @@ class LOOPLoss(LossModule):
         names = self.tensor_keys
         own = [names.action, names.sample_log_prob, names.advantage, names.step_mask]
         own += [names.token_is_pad] if names.token_is_pad in self.actor_network.out_keys else []
-        own += [names.held, names.reference_loc, names.reference_scale] if self.hold_coef else []
+        own += [names.held, names.reference_loc, names.reference_scale] if self.reference_coef else []
         return [*own, *(key for key in self.actor_network.in_keys if key not in own)]
 
     @property
     def out_keys(self) -> list[str]:
-        return ["loss_objective", *(["loss_hold"] if self.hold_coef else []), "kl_approx", "clip_fraction", "ESS"]
+        return [
+            "loss_objective",
+            *(["loss_reference"] if self.reference_coef else []),
+            "kl_approx",
+            "clip_fraction",
+            "ESS",
+        ]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -202,8 +209,8 @@ class LOOPLoss(LossModule):
                 gain = gain.mean(-1)
         weight = self._weight(tensordict, steps, gain.dtype)
         out = {"loss_objective": -(gain * weight).sum()}
-        if self.hold_coef:
-            out["loss_hold"] = self.hold_coef * (self._away(tensordict, distribution, steps) * weight).sum()
+        if self.reference_coef:
+            out["loss_reference"] = self.reference_coef * (self._away(tensordict, distribution, steps) * weight).sum()
         return TensorDict(out | self._diagnostics(log_ratio.detach(), mask))
 
     @torch.no_grad()
@@ -230,12 +237,12 @@ class LOOPLoss(LossModule):
         loc, scale = (tensordict.get(name, None) for name in (names.reference_loc, names.reference_scale))
         if held is None or loc is None or scale is None:
             raise ValueError(
-                f"hold_coef needs {names.held!r} {[*steps.shape[:-1], 1]}, {names.reference_loc!r} and "
-                f"{names.reference_scale!r}, the reference's at each decision: write them, or pass hold_coef=0"
+                f"reference_coef needs {names.held!r} {[*steps.shape[:-1], 1]}, {names.reference_loc!r} and "
+                f"{names.reference_scale!r}, the reference's at each decision: write them, or pass reference_coef=0"
             )
         mean = getattr(distribution, "loc", None)
         if mean is None:
-            raise ValueError(f"hold_coef needs an actor with a location, got {type(distribution).__name__}")
+            raise ValueError(f"reference_coef needs an actor with a location, got {type(distribution).__name__}")
         return torch.where(steps & held, ((mean - loc).abs() / scale).mean(-1), 0.0)
 
     def _compared(self, tensordict: TensorDictBase, steps: Tensor) -> tuple[Distribution, Tensor, Tensor, Tensor]:
