@@ -31,7 +31,7 @@ from worldenv_trl.metrics import (
 from worldenv_trl.reflectors import Reflector, StopRule
 from worldenv_trl.world_models import WorldModel
 
-REAL, AHEAD, IMAGINED = "real frames", "one chunk ahead", "imagined"
+REAL, AHEAD, IMAGINED, DREAMT = "real frames", "one chunk ahead", "imagined", "dreamt"
 
 
 @dataclass(frozen=True)

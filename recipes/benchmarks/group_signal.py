@@ -14,8 +14,10 @@ bootstrap over groups:
 - ECE (expected calibration error, ten bins) and slope of the return against the goal being reached by the end.
 
 Rows: the reflector on the real frames (its ceiling); one chunk ahead (real frames as memory at the start of every
-chunk); imagination. The last table is r when real frames are shown to the first chunks only: when the truth is lost. A
-judge that looks at no video (``reflector.path_steps``) has no need of either: "imagined" is then what it says.
+chunk); imagination; with ``--dreamt`` also other groups, from the same initial states, that the policy dreamt: what it
+does when it looks at imagined frames, as in LOOP, judged there and then lived in the physics. The last table is r when
+real frames are shown to the first chunks only: when the truth is lost. A judge that looks at no video
+(``reflector.path_steps``) has no need of either: "imagined" is then what it says.
 """
 
 from __future__ import annotations
@@ -35,15 +37,18 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from command_line import at_least, refusals, writable
+from dreamt_groups import dreamt_groups
 from gather_evidence import read_config
 from group_views import (
     AHEAD,
+    DREAMT,
     FIGURES,
     IMAGINED,
     RuledReflector,
     curve,
     figures,
     mean_correlation,
+    view,
     views,
 )
 from real_groups import Draw, RealGroups, check_draw, real_groups
@@ -78,6 +83,8 @@ class Settings:
     """Folder of the groups, RUN/signal/POLICY if not given. Groups that are there are read, not drawn again."""
     overwrite: bool = False
     """Draw the groups again."""
+    dreamt: bool = False
+    """What the policy does in imagination, too: about as long again as the groups in the physics took."""
     shown_chunks: tuple[int, ...] = (2, 4, 6)
     """Numbers of chunks, at least 2, up to which real frames are shown; 1 and all are always there. Each number is up
     to another imagination of the mixed groups."""
@@ -132,7 +139,10 @@ def main(settings: Settings) -> Path:
         }
         if before is not None:
             _check_comparable(report, before, settings.against)
-    report |= measure(run, groups, world_model, judge, settings, before)
+        dreams = None
+        if settings.dreamt:
+            dreams = dreamt_groups(run, policy, world_model, groups, factor, settings.seed)
+    report |= measure(run, groups, world_model, judge, settings, before, dreams)
     out.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
     print(markdown(report))
     print(f"\n{out}: all figures; measured in {report['seconds']:.0f} s")
@@ -167,13 +177,16 @@ def measure(
     judge: RuledReflector,
     settings: Settings,
     before: dict[str, Any] | None = None,
+    dreams: RealGroups | None = None,
 ) -> dict[str, Any]:
     """All figures as plain values, by view, task and name: ``[value, low, high]``, None where one cannot be said.
 
-    ``before``: a report of the same groups to compare with.
+    ``before``: a report of the same groups to compare with. ``dreams``: groups of the same contexts, dreamt.
     """
     started = time.monotonic()
     seen, ahead = views(judge, world_model, run.kinematics, groups)
+    if dreams is not None:
+        seen[DREAMT] = view(judge, dreams, dreams.episodes)
     chunks = math.ceil(groups.episodes["actions"].shape[1] / world_model.chunk_length)
     between = tuple(sorted({shown for shown in settings.shown_chunks if shown < chunks}))
     shown_to = {1: seen[IMAGINED].correlations}
@@ -192,6 +205,7 @@ def measure(
                 "groups": int(rows.sum()),
                 "mixed": int(groups.mixed[rows].sum()),
                 "success": groups.success[rows].float().mean().item(),
+                **({} if dreams is None else {"dreamt_success": dreams.success[rows].float().mean().item()}),
             }
             for task, rows in kinds.items()
         },
@@ -224,9 +238,12 @@ def _plain(estimate: Estimate) -> list[float | None]:
 
 def markdown(report: dict[str, Any]) -> str:
     """The tables of a report."""
-    lines = ["| task | groups | mixed | real success |", "|---|---|---|---|"]
+    dreamt = {task: each["dreamt_success"] for task, each in report["groups"].items() if "dreamt_success" in each}
+    lines = [f"| task | groups | mixed | real success |{' of actions dreamt |' if dreamt else ''}"]
+    lines += ["|---|---|---|---|" + "---|" * bool(dreamt)]
     lines += [
         f"| {_short(task)} | {each['groups']} | {each['mixed']} | {each['success']:.2f} |"
+        + (f" {dreamt[task]:.2f} |" if dreamt else "")
         for task, each in report["groups"].items()
     ]
     names = [name.replace("_", " ") for name in FIGURES]

@@ -11,11 +11,13 @@ import torch
 from tensordict import TensorDict
 from test_benchmarks import benchmark
 
-from group_views import AHEAD, FIGURES, IMAGINED, REAL, RuledReflector, curve, views
+from dreamt_groups import dreamt_groups, in_order
+from group_views import AHEAD, DREAMT, FIGURES, IMAGINED, REAL, RuledReflector, curve, views
 from parts import make_policy, make_reflector, make_world_model
 from real_groups import Draw, RealGroups, real_groups
 from run import Run, write_rules
 from run_folder import RunFolder
+from two_worlds import relive
 from worldenv_trl.envs import context_id
 from worldenv_trl.metrics import group_correlations
 from worldenv_trl.record import read_rollouts
@@ -102,6 +104,29 @@ def test_views_hold_returns_of_the_reflector_and_success_of_the_physics(run, tmp
         assert torch.allclose(later[shown], expected, equal_nan=True)
 
 
+def test_what_is_dreamt_begins_where_the_groups_do_and_is_labelled_by_the_physics(run, tmp_path):
+    groups = real_groups(run, run.policy("sft"), DRAW, tmp_path)
+    dreams = dreamt_groups(run, run.policy("sft"), run.world_model(), groups, 1.0, seed=0)
+    assert torch.equal(dreams.context_id, groups.context_id) and torch.equal(dreams.task_id, groups.task_id)
+    rows, first, later = torch.arange(8), torch.tensor(0), torch.tensor(5)
+    lived, dreamt = groups.episodes, dreams.episodes
+    assert torch.equal(dreamt.frames("agentview", rows, first), lived.frames("agentview", rows, first))
+    assert (dreamt.frames("agentview", rows, later) != lived.frames("agentview", rows, later)).flatten(1).any(1).all()
+    poses = run.kinematics.rollout(lived["kinematic_states"][:, 0], dreamt["actions"])
+    assert torch.allclose(dreamt["kinematic_states"][:, 1:], poses, atol=1e-5)
+    assert torch.equal(dreamt["success"], relive(run, dreamt))
+    actions = dreams.grouped(dreamt["actions"])
+    assert (actions[:, 0] != actions[:, 1]).flatten(1).any(1).all()  # of a group, too
+    again = dreamt_groups(run, run.policy("sft"), run.world_model(), groups, 1.0, seed=0)
+    assert torch.equal(again.episodes["actions"], dreamt["actions"])
+
+
+def test_groups_that_end_in_another_order_are_put_in_theirs(run, tmp_path):
+    groups = real_groups(run, run.policy("sft"), DRAW, tmp_path)
+    mixed = groups.episodes[torch.tensor([4, 5, 0, 1, 6, 7, 2, 3])]
+    assert torch.equal(in_order(mixed, groups)["actions"], groups.episodes["actions"])
+
+
 def test_the_command_leaves_its_figures(run, capsys):
     out = command(run)
     report = json.loads(out.read_text())
@@ -111,9 +136,12 @@ def test_the_command_leaves_its_figures(run, capsys):
     assert list(report["views"][REAL]["all"]) == list(FIGURES) and list(report["curve"]["all"]) == ["1", "2"]
     assert "| real frames | all |" in (shown := capsys.readouterr().out) and "calibration error" in shown
     other = shutil.copytree(run.folder.checkpoint("world_model"), run.folder.path / "elsewhere")
-    again = command(run, against=out, world_model=str(other))
+    again = command(run, against=out, world_model=str(other), dreamt=True)
+    report = json.loads(again.read_text())
+    assert list(report["views"]) == [REAL, AHEAD, IMAGINED, DREAMT] and "dreamt_success" in report["groups"]["all"]
+    assert "real success | of actions dreamt |" in (shown := capsys.readouterr().out) and "| dreamt | all |" in shown
     assert again == out.with_name(f"elsewhere_{report['models']['world_model']['hash'][:8]}-reflector.json")
-    assert set(json.loads(again.read_text())["gain"]) == {"all", *run.config.tasks}
+    assert set(report["gain"]) == {"all", *run.config.tasks}
 
 
 def test_nothing_is_imagined_for_a_judge_that_looks_at_no_video(run, monkeypatch):
