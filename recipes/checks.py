@@ -36,7 +36,7 @@ def check_shares(config: WorldEnvConfig, processes: int) -> None:
 
 
 def check_loop(config: WorldEnvConfig, policy: Policy) -> None:
-    """Raises ``ValueError`` for a ratio that the policy does not have, and if it has no mean to be held."""
+    """Raises ``ValueError`` for a ratio that the policy does not have, and if it has no mean to be kept."""
     level = config.post_train.ratio_level
     if isinstance(policy, TokenPolicy) and policy.sequential and level == "step":
         raise ValueError(
@@ -48,11 +48,12 @@ def check_loop(config: WorldEnvConfig, policy: Policy) -> None:
             f"post_train.ratio_level must be step or chunk for {type(policy).__name__}, which does not act by tokens, "
             "got 'token'"
         )
-    if isinstance(policy, TokenPolicy) and config.post_train.hold:
-        raise ValueError(
-            f"post_train.hold is for policies with a mean, and {type(policy).__name__} acts by tokens: it must be 0, "
-            f"got {config.post_train.hold:g}"
-        )
+    for name, value in (("post_train.hold", config.post_train.hold), ("adapt.steps", config.adapt.steps)):
+        if isinstance(policy, TokenPolicy) and value:
+            raise ValueError(
+                f"{name} is for policies with a mean, and {type(policy).__name__} acts by tokens: it must be 0, "
+                f"got {value:g}"
+            )
 
 
 def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:

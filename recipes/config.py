@@ -147,6 +147,19 @@ class Reflector:
 
 
 @dataclass(frozen=True)
+class Adapt:
+    """Before LOOP the policy learns to do on imagined frames what it does on the real ones (``adapt.py``)."""
+
+    steps: int = 0
+    """0 leaves the stage out."""
+    episodes_per_task: int = 64
+    """Explored episodes of each task that are imagined for it, as many as there are at most."""
+    batch_size: int = 48
+    """Decisions, each seen both ways."""
+    lr: float = 3e-4
+
+
+@dataclass(frozen=True)
 class PostTrain:
     """LOOP (World-Env Algorithm 1)."""
 
@@ -297,6 +310,7 @@ class WorldEnvConfig:
     explore: Explore = field(default_factory=Explore)
     world_model: WorldModel = field(default_factory=WorldModel)
     reflector: Reflector = field(default_factory=Reflector)
+    adapt: Adapt = field(default_factory=Adapt)
     post_train: PostTrain = field(default_factory=PostTrain)
     evaluate: Evaluate = field(default_factory=Evaluate)
     real_size: RealSize = field(default_factory=RealSize)

@@ -27,7 +27,7 @@ from worldenv_trl.policies import AutoregressiveActor, LaplaceActor, Policy, pol
 from worldenv_trl.record import model_hash, parse_edit, read_metadata, replay
 from worldenv_trl.record.replay.source import open_rollout
 
-_NAMES = {"policy": ("sft", "post_train*"), "world_model": ("world_model*",), "reflector": ("reflector*",)}
+_NAMES = {"policy": ("sft", "adapted*", "post_train*"), "world_model": ("world_model*",), "reflector": ("reflector*",)}
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ class Run:
         torch.manual_seed(self.seed(stage))
 
     def policy(self, name: str) -> Policy:
-        stage = "sft" if name == "sft" else "post_train"
+        stage = {"sft": "sft", "adapted": "adapt"}.get(name.split("_")[0], "post_train")
         return self.parts.policy.load(self.folder.require_checkpoint(name, stage)).to(self.device)
 
     def world_model(self, suffix: str = "") -> WorldModel:

@@ -143,6 +143,10 @@ def stage_flops(kind: str, config: WorldEnvConfig, found: Rehearsal, *, refit: b
             return flops + calls["learn"].flops
         taught = config.demonstrate.episodes_per_task * tasks + episodes - kept + imagined
         return flops + taught * (config.max_steps * calls["see"].flops + _PREFIXES * calls["judge"].flops)
+    if kind == "adapt":
+        told = config.adapt
+        shown = told.episodes_per_task * tasks * length * (calls["imagine"].flops + decide)
+        return shown + 2 * told.steps * told.batch_size * calls["update"].flops
     if kind == "post_train":
         settings = config.post_train
         looked = settings.probe_contexts * tasks * length
@@ -192,6 +196,10 @@ def _memory(kind: str, config: WorldEnvConfig, found: Rehearsal, machine: Machin
         learning = calls["learn"].activation_bytes if "learn" in calls else 0.0
         held = [Held(sizes["world_model"]), Held(sizes["reflector"], learns=True)]
         return held, max(learning, imagined(min(found.rows_imagined, rows(explored(config)))))
+    if kind == "adapt":
+        batch = 2 * rows(config.adapt.batch_size) * calls["update"].activation_bytes
+        painting = found.rows_imagined * calls["imagine"].activation_bytes
+        return [Held(sizes["policy"], learns=True), Held(sizes["world_model"])], max(batch, painting)
     if kind == "post_train":
         settings = config.post_train
         videos = rows(settings.groups * settings.group_size)

@@ -32,12 +32,13 @@ Work = Callable[..., None]
 """``work(run, **options)``: what a stage does."""
 
 
-SHARED = {"sft", "train_world_model", "train_reflector", "post_train"}
+SHARED = {"sft", "train_world_model", "train_reflector", "adapt", "post_train"}
 """Kinds of stages that all processes work on; the others are the main one's."""
 
 
 _MAKES = {
     "sft": "policy",
+    "adapt": "policy",
     "post_train": "policy",
     "train_world_model": "world_model",
     "train_reflector": "reflector",
@@ -78,13 +79,18 @@ def plan(config: WorldEnvConfig) -> list[Stage]:
         see = {"policy": policy, "target": explored}
         dream = {"target": world, "previous": previous, "rounds": number}
         score = {"target": reflector, "models": models, "rounds": number}
-        learn = {"source": policy, "target": improved, "models": models}
         stages += [
             Stage(explored, "explore", f"rollouts/{explored}.mcap", see),
             Stage(world, "train_world_model", f"checkpoints/{world}", dream),
             Stage(reflector, "train_reflector", f"checkpoints/{reflector}", score),
-            Stage(improved, "post_train", f"checkpoints/{improved}", learn),
         ]
+        if config.adapt.steps:
+            adapted = f"adapted{models}"
+            seen = {"source": policy, "target": adapted, "models": models}
+            stages.append(Stage(adapted, "adapt", f"checkpoints/{adapted}", seen))
+            policy = adapted
+        learn = {"source": policy, "target": improved, "models": models}
+        stages.append(Stage(improved, "post_train", f"checkpoints/{improved}", learn))
         policy, previous = improved, world
     options = {"before": "sft", "after": policy, "models": models}
     return [*stages, Stage("evaluate", "evaluate", "metrics.jsonl", options)]

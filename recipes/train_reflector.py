@@ -8,7 +8,6 @@ Alone: ``python recipes/train_reflector.py improve --run-dir runs/improve``.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
 from typing import Any, cast
 
 import torch
@@ -16,11 +15,12 @@ import torch
 import processes
 from data_parallel import DataParallel, WholeOptimizer
 from episodes import demonstrations_and_exploration, split_by_context
-from resumable import Outside, Resumable
+from imagining import imagined
+from resumable import Resumable
 from run import LATE, Run, write_rules
 from stages import run_alone
 from worldenv_trl import keys
-from worldenv_trl.data import Episodes, ImaginedSoFar, imagine_episodes, score_episodes
+from worldenv_trl.data import Episodes, score_episodes
 from worldenv_trl.metrics import choose_rule, frame_figures, stop_figures
 from worldenv_trl.objectives import ReflectorLoss
 from worldenv_trl.pretrained import Pretrained
@@ -39,11 +39,7 @@ def train_reflector(run: Run, target: str = "reflector", models: str = "", round
     with run.folder.lasting_scratch() as scratch:
 
         def imagine(episodes: Episodes, name: str) -> Episodes:
-            def batches(count: int, made: ImaginedSoFar) -> Iterable[int]:
-                return Resumable(run, f"imagines {name}", count, made=Outside(made)).bar(label, "batch")
-
-            label, folder, seed = f"{target} imagines {name}", f"{scratch}/{name}", run.seed(target, f"imagines {name}")
-            return imagine_episodes(world_model, episodes, run.kinematics, seed=seed, folder=folder, batches=batches)
+            return imagined(run, world_model, episodes, target, name, scratch)
 
         reflector = run.parts.reflector.make(config).to(run.device)
         episodes, shown = [demonstrated, training], {"real": held_out, "imagined": held_out}

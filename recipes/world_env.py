@@ -20,6 +20,7 @@ from contextlib import closing
 
 import processes
 import report
+from adapt import adapt
 from command_line import refusals
 from config import WorldEnvConfig
 from demonstrate import demonstrate
@@ -41,6 +42,7 @@ WORKS: dict[str, Work] = {
     "explore": explore,
     "train_world_model": train_world_model,
     "train_reflector": train_reflector,
+    "adapt": adapt,
     "post_train": post_train,
     "evaluate": evaluate,
 }

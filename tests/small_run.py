@@ -10,6 +10,7 @@ import config
 from parts import COMPACT
 from run import Run
 from stages import open_run
+from worldenv_trl.policies import TokenPolicy
 
 SMALL = dataclasses.replace(
     config.PRESETS["smoke"][1],
@@ -33,3 +34,10 @@ def with_untrained_policy(settings: config.WorldEnvConfig) -> Run:
     torch.manual_seed(0)
     COMPACT.policy.make(run.config).save_pretrained(run.folder.checkpoint("sft"))
     return run
+
+
+def token_policy() -> TokenPolicy:
+    """One that acts by tokens and can do nothing else."""
+    tokens = type("Tokens", (TokenPolicy,), {})
+    tokens.__abstractmethods__ = frozenset()
+    return object.__new__(tokens)

@@ -20,7 +20,13 @@ from run_folder import RunFolder
 from stages import open_run, run_stages
 from world_env import WORKS
 
-STAGES = {"sft": "sft", "train_world_model": "world_model", "train_reflector": "reflector", "post_train": "post_train"}
+STAGES = {
+    "sft": "sft",
+    "train_world_model": "world_model",
+    "train_reflector": "reflector",
+    "adapt": "adapted",
+    "post_train": "post_train",
+}
 PHYSICS = {"post_train": {"env": "tabletop", "iterations": 2, "probe_every": 0}}
 
 
@@ -122,6 +128,7 @@ def test_each_process_learns_from_half_the_rows(two):
     rows = {kind: [json.loads((two / kind / f"rows_{rank}.json").read_text()) for rank in range(2)] for kind in STAGES}
     assert rows["sft"] == [25 * [4]] * 2 and rows["train_world_model"] == [20 * [1]] * 2
     assert rows["train_reflector"] == [40 * [4]] * 2
+    assert rows["adapt"] == [20 * [8]] * 2  # four decisions, each seen both ways
     # Two groups of nine rollouts of two decisions, twice an iteration, for five; one row for a turn without any.
     mine, other = rows["post_train"]
     assert len(mine) == len(other) > 20 and max(mine + other) == 16

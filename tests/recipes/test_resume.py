@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import shutil
 from functools import partial
@@ -30,6 +31,7 @@ SETTINGS = dataclasses.replace(
     sft=config.SFT(steps=4, scale_steps=3, batch_size=8),
     world_model=config.WorldModel(steps=4, batch_size=2),
     reflector=config.Reflector(encoder_steps=3, steps=3, batch_size=4),
+    adapt=config.Adapt(steps=4, episodes_per_task=4, batch_size=4),
     post_train=config.PostTrain(
         iterations=3,
         groups=2,
@@ -70,7 +72,7 @@ def copy_of(straight: Path, path: Path, **changes) -> Run:
 def break_at(monkeypatch, name: str, call: int) -> None:
     """Lets the so many-th call of ``name`` fail."""
     module, _, attribute = name.rpartition(".")
-    owner = torch.Tensor if module == "torch.Tensor" else __import__(module)
+    owner = functools.reduce(getattr, module.split(".")[1:], __import__(module.split(".")[0]))
     original, calls = getattr(owner, attribute), []
 
     def counted(*arguments, **options):
@@ -102,6 +104,8 @@ def metrics(folder: RunFolder, stage: str) -> list[str]:
         ("train_reflector", "train_reflector.learn", 1, "reflector: imagines held out was finished"),
         ("train_reflector", "torch.Tensor.backward", 3, "reflector: 0_encoder continues after step 2 of 3"),
         ("train_reflector", "torch.Tensor.backward", 6, "reflector: 1_head continues after step 2 of 3"),
+        ("adapt", "adapt.Decisions.refer", 1, "adapted: imagines explored was finished"),
+        ("adapt", "torch.Tensor.backward", 4, "adapted: steps continues after step 2 of 4"),
         ("post_train", "post_train.rloo_advantage", 3, "post_train: iterations continues after step 2 of 3"),
         ("evaluate", "evaluate.physics_outcomes", 4, "evaluate: policies continues after step 3 of 4"),
     ],
@@ -145,7 +149,7 @@ def test_imagined_episodes_continue_batch_by_batch(straight, tmp_path, monkeypat
         return paint(*given)
 
     monkeypatch.setattr(imagine, "_imagine", painting)
-    monkeypatch.setattr("train_reflector.imagine_episodes", partial(imagine.imagine_episodes, rows_at_once=2))
+    monkeypatch.setattr("imagining.imagine_episodes", partial(imagine.imagine_episodes, rows_at_once=2))
     rerun("train_reflector", WORKS["train_reflector"], runs[0])
     whole = painted.copy()
     assert whole == [[0, 1], [2, 3], [4, 5], [0, 1]]  # for training, and held out
@@ -217,7 +221,7 @@ def test_a_judge_of_paths_learns_without_imagined_episodes_continues_and_rewards
 ):
     judged = dataclasses.replace(SETTINGS.reflector, path_steps=3)
     runs = [copy_of(straight, tmp_path / name, reflector=judged) for name in ("straight", "broken")]
-    monkeypatch.delattr("train_reflector.imagine_episodes")
+    monkeypatch.delattr("imagining.imagine_episodes")
     rerun("train_reflector", WORKS["train_reflector"], runs[0])
     with monkeypatch.context() as patch:
         patch.setattr(Resumable, "_due", lambda self: self.step % 2 == 0)

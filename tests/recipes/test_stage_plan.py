@@ -67,6 +67,15 @@ def test_a_stage_takes_its_rows_times_what_a_row_takes():
     assert stage_flops("evaluate", CONFIG, found()) == 2 * 5 * 2 * 2 * (2 + judged)
 
 
+def test_adapting_imagines_its_episodes_and_sees_a_batch_both_ways():
+    adapting = dataclasses.replace(CONFIG, adapt=settings.Adapt(steps=10, episodes_per_task=3, batch_size=8))
+    assert stage_flops("adapt", adapting, found()) == 3 * 2 * 2 * (10 + 1) + 10 * 2 * 8 * 3
+    plans = {stage.name: stage for stage in stage_plans(adapting, found(), GPUS)}
+    assert "adapted" not in {stage.name for stage in stage_plans(CONFIG, found(), GPUS)}
+    painted, updated = 8 * 5.0, 2 * 2 * 4.0  # two of eight decisions on each GPU
+    assert plans["adapted"].whole_bytes == (400 + 40 + 80) + 200 + max(painted, updated)
+
+
 def test_probes_add_their_contexts():
     probing = dataclasses.replace(CONFIG.post_train, probe_every=2, probe_contexts=3)
     probed = dataclasses.replace(CONFIG, post_train=probing)

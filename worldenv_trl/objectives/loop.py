@@ -14,6 +14,7 @@ from torch.distributions import Distribution
 from torchrl.objectives.common import LossModule
 
 from worldenv_trl import keys
+from worldenv_trl.objectives.distillation import away_from
 
 __all__ = ["LOOPLoss"]
 
@@ -243,7 +244,7 @@ class LOOPLoss(LossModule):
         mean = getattr(distribution, "loc", None)
         if mean is None:
             raise ValueError(f"reference_coef needs an actor with a location, got {type(distribution).__name__}")
-        return torch.where(steps & held, ((mean - loc).abs() / scale).mean(-1), 0.0)
+        return torch.where(steps & held, away_from(mean, loc, scale), 0.0)
 
     def _compared(self, tensordict: TensorDictBase, steps: Tensor) -> tuple[Distribution, Tensor, Tensor, Tensor]:
         """What the actor says now, log-ratios of the executed steps [*B, C], where they hold, and the advantage; see
