@@ -25,18 +25,20 @@ from physics import exploring_actor
 from resumable import Resumable
 from run import Run
 from stages import run_alone
+from updates import rows_at_once
 from worldenv_trl import keys
 from worldenv_trl.data import Episodes
-from worldenv_trl.devices import to_device
+from worldenv_trl.devices import device_of, to_device
 from worldenv_trl.objectives import DistillationLoss
 from worldenv_trl.policies import Policy
 from worldenv_trl.row_texts import row_texts
 
-_ROWS = 256  # decisions at a time, where nothing is learned
-
 
 def adapt(run: Run, source: str = "sft", target: str = "adapted", models: str = "") -> None:
-    """Imagines explored episodes of a round in its world model; writes ``checkpoints/<target>``."""
+    """Imagines explored episodes of a round in its world model; writes ``checkpoints/<target>``.
+
+    All groups of parameters move that LOOP's rank gives (``Policy.post_training_parameters``).
+    """
     config, settings = run.config, run.config.adapt
     run.seed_everything(target)
     policy = run.policy(source).eval()
@@ -96,8 +98,8 @@ class Decisions:
     """
 
     def __init__(self, episodes: Episodes, dreamt: Episodes, policy: Policy, chunk_length: int) -> None:
-        self._shown, self._device = (episodes, dreamt), next(policy.parameters()).device
-        self._cameras = policy.cameras
+        self._shown, self._device = (episodes, dreamt), device_of(policy)
+        self._cameras, self._pixels = policy.cameras, len(policy.cameras) * 3 * policy.image_size**2
         steps = torch.arange(0, episodes["actions"].shape[1], chunk_length)
         self._row, place = (steps < episodes["length"]).nonzero(as_tuple=True)
         self._step = steps[place]
@@ -109,11 +111,14 @@ class Decisions:
     @torch.no_grad()
     def refer(self, actor: Any) -> None:
         """Notes what ``actor`` does where the world is seen."""
-        found = [actor.get_dist(self.seen(rows, dreamt=False)) for rows in torch.arange(len(self)).split(_ROWS)]
+        at_once = rows_at_once(self._pixels, self._device.type)
+        found = [actor.get_dist(self.seen(rows, dreamt=False)) for rows in torch.arange(len(self)).split(at_once)]
         self._reference = [torch.cat([getattr(each, name) for each in found]) for name in ("loc", "scale")]
 
     def seen(self, rows: Tensor, *, dreamt: bool) -> TensorDictBase:
-        """What a policy sees at some decisions [n], and once it is known what it is to do, on the policy's device."""
+        """What a policy sees at the decisions ``rows`` int64 [n]: images uint8 [n, 3, H, W], state [n, 7] and
+        instruction, and once :meth:`refer` was called the reference's ``loc`` and ``scale`` [n, C, 7]; on its device.
+        """
         row, step = self._row[rows], self._step[rows]
         shown = self._shown[dreamt]
         out = TensorDict({keys.STATE: self._shown[0]["states"][row, step]}, batch_size=[len(rows)])

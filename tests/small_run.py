@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -34,6 +36,11 @@ def with_untrained_policy(settings: config.WorldEnvConfig) -> Run:
     torch.manual_seed(0)
     COMPACT.policy.make(run.config).save_pretrained(run.folder.checkpoint("sft"))
     return run
+
+
+def small_untrained(folder: Path, **changes: Any) -> Run:
+    """The same of :data:`SMALL` with some settings changed, in ``folder``."""
+    return with_untrained_policy(dataclasses.replace(SMALL, run_dir=folder / "run", **changes))
 
 
 def token_policy() -> TokenPolicy:

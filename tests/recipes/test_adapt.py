@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 import torch
-from small_run import SMALL, token_policy, with_untrained_policy
+from small_run import small_untrained, token_policy
 
 import config
 from adapt import Decisions, adapt, sampled_as_in_loop
@@ -24,15 +24,12 @@ from worldenv_trl.record import read_rollouts
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """An exploration of three scales of a policy that looks closely, and a world model that has learned nothing."""
-    run = with_untrained_policy(
-        dataclasses.replace(
-            SMALL,
-            run_dir=tmp_path_factory.mktemp("adapt") / "run",
-            max_steps=40,
-            tasks=config.GOAL_TASKS[1:],
-            explore=config.Explore(episodes_per_task=6, num_envs=4, scale_factors=(2.0, 0.0, 1.0), replay_share=0.0),
-            adapt=config.Adapt(steps=150, episodes_per_task=2, batch_size=8, lr=2e-5),
-        )
+    run = small_untrained(
+        tmp_path_factory.mktemp("adapt"),
+        max_steps=40,
+        tasks=config.GOAL_TASKS[1:],
+        explore=config.Explore(episodes_per_task=6, num_envs=4, scale_factors=(2.0, 0.0, 1.0), replay_share=0.0),
+        adapt=config.Adapt(steps=150, episodes_per_task=2, batch_size=8, lr=2e-5),
     )
     policy = run.policy("sft")
     with torch.no_grad():

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 import torch
-from small_run import SMALL, token_policy, with_untrained_policy
+from small_run import SMALL, small_untrained, token_policy, with_untrained_policy
 from tensordict import TensorDict
 
 import config
@@ -37,13 +37,10 @@ def test_a_share_is_of_all_rollouts_of_a_task():
 @pytest.fixture(scope="module")
 def explored(tmp_path_factory):
     """An exploration whose second scale is greedy, and the demonstrations that are stored with it."""
-    run = with_untrained_policy(
-        dataclasses.replace(
-            SMALL,
-            run_dir=tmp_path_factory.mktemp("holding") / "run",
-            max_steps=40,
-            explore=config.Explore(episodes_per_task=4, num_envs=2, scale_factors=(1.0, 0.0), replay_share=0.0),
-        )
+    run = small_untrained(
+        tmp_path_factory.mktemp("holding"),
+        max_steps=40,
+        explore=config.Explore(episodes_per_task=4, num_envs=2, scale_factors=(1.0, 0.0), replay_share=0.0),
     )
     demonstrate(run)
     explore(run)

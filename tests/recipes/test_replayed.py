@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 import torch
-from small_run import SMALL, with_untrained_policy
+from small_run import small_untrained
 from tensordict import TensorDict
 from test_resumed_recordings import Interrupted, interrupt, result
 
@@ -29,18 +29,15 @@ SHIFT = 0.04
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """Demonstrations of two tasks, and an untrained policy, which succeeds at nothing."""
-    run = with_untrained_policy(
-        dataclasses.replace(
-            SMALL,
-            run_dir=tmp_path_factory.mktemp("replayed") / "run",
-            tasks=TASKS,
-            max_steps=40,
-            checkpoint_minutes=0.0,
-            demonstrate=config.Demonstrate(episodes_per_task=3),
-            explore=config.Explore(
-                episodes_per_task=8, num_envs=3, scale_factors=(0.0,), replay_share=0.5, replay_shift_m=SHIFT
-            ),
-        )
+    run = small_untrained(
+        tmp_path_factory.mktemp("replayed"),
+        tasks=TASKS,
+        max_steps=40,
+        checkpoint_minutes=0.0,
+        demonstrate=config.Demonstrate(episodes_per_task=3),
+        explore=config.Explore(
+            episodes_per_task=8, num_envs=3, scale_factors=(0.0,), replay_share=0.5, replay_shift_m=SHIFT
+        ),
     )
     demonstrate(run)
     yield run
