@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.nn import Module
 from tqdm import tqdm
 
 from physics import chunk_player, exploring_actor, recording, starting_at, step_env
@@ -87,16 +90,29 @@ def real_groups(run: Run, policy: Policy, draw: Draw, folder: Path, overwrite: b
     """
     check_draw(run, draw)
     path = folder / "groups.mcap"
+    made = partial(_live, run, policy, draw, path)
+    return RealGroups(kept_episodes(run, path, draw, {"policy": policy}, made, overwrite), draw.group_size)
+
+
+def kept_episodes(
+    run: Run, path: Path, draw: Draw, models: Mapping[str, Module], make: Callable[[], None], overwrite: bool = False
+) -> Episodes:
+    """The episodes recorded in ``path``, by ``make`` if there are none; their frames are in a store beside it.
+
+    Raises:
+        ValueError: for a recording of another draw, other models or another run.
+    """
     if path.is_file() and not overwrite:
-        _check_same(run, policy, draw, path)
+        _check_same(run, models, draw, path)
     else:
-        folder.mkdir(parents=True, exist_ok=True)
-        _live(run, policy, draw, path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        make()
+    store = path.parent / "episodes"
     try:
-        (episodes,) = open_store(folder / "episodes", [path])
+        (episodes,) = open_store(store, [path])
     except (FileNotFoundError, ValueError):  # the recording is the record: nothing is lost with a store
-        (episodes,) = fill_store(folder / "episodes", [path])
-    return RealGroups(episodes, draw.group_size)
+        (episodes,) = fill_store(store, [path])
+    return episodes
 
 
 def check_draw(run: Run, draw: Draw) -> None:
@@ -115,12 +131,12 @@ def check_draw(run: Run, draw: Draw) -> None:
         raise ValueError(f"scale_factor must be positive, got {draw.scale_factor}")
 
 
-def _check_same(run: Run, policy: Policy, draw: Draw, path: Path) -> None:
+def _check_same(run: Run, models: Mapping[str, Module], draw: Draw, path: Path) -> None:
     metadata, config = read_metadata(path), run.config
     env = metadata.get("env", {})
     pairs = {
         **{name: (metadata.get("draw", {}).get(name), value) for name, value in asdict(draw).items()},
-        "policy": (metadata.get("models", {}).get("policy"), model_hash(policy)),
+        **{name: (metadata.get("models", {}).get(name), model_hash(model)) for name, model in models.items()},
         "the tasks": (metadata.get("digests"), [load_task(task).digest for task in config.tasks]),
         "cameras": (env.get("cameras"), list(config.cameras)),
         "image_size": (env.get("image_size"), config.image_size),

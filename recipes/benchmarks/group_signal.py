@@ -15,8 +15,8 @@ bootstrap over groups:
 
 Rows: the reflector on the real frames (its ceiling); one chunk ahead (real frames as memory at the start of every
 chunk); imagination; with ``--dreamt`` also other groups, from the same initial states, that the policy dreamt: what it
-does when it looks at imagined frames, as in LOOP, judged there and then lived in the physics. The last table is r when
-real frames are shown to the first chunks only: when the truth is lost. A judge that looks at no video
+does when it looks at imagined frames, as in LOOP, judged there and then lived in the physics (kept, too). The last
+table is r when real frames are shown to the first chunks only: when the truth is lost. A judge that looks at no video
 (``reflector.path_steps``) has no need of either: "imagined" is then what it says.
 """
 
@@ -82,9 +82,10 @@ class Settings:
     groups: Path | None = None
     """Folder of the groups, RUN/signal/POLICY if not given. Groups that are there are read, not drawn again."""
     overwrite: bool = False
-    """Draw the groups again."""
+    """Draw the groups again, and dream again."""
     dreamt: bool = False
-    """What the policy does in imagination, too: about as long again as the groups in the physics took."""
+    """What the policy does in imagination, too: for each world model about as long again, once, as the groups in the
+    physics took."""
     shown_chunks: tuple[int, ...] = (2, 4, 6)
     """Numbers of chunks, at least 2, up to which real frames are shown; 1 and all are always there. Each number is up
     to another imagination of the mixed groups."""
@@ -141,7 +142,9 @@ def main(settings: Settings) -> Path:
             _check_comparable(report, before, settings.against)
         dreams = None
         if settings.dreamt:
-            dreams = dreamt_groups(run, policy, world_model, groups, factor, settings.seed)
+            dreams = dreamt_groups(
+                run, policy, world_model, groups, draw, folder / f"dreams-{names[1]}", settings.overwrite
+            )
     report |= measure(run, groups, world_model, judge, settings, before, dreams)
     out.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
     print(markdown(report))

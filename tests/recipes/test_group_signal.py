@@ -105,8 +105,8 @@ def test_views_hold_returns_of_the_reflector_and_success_of_the_physics(run, tmp
 
 
 def test_what_is_dreamt_begins_where_the_groups_do_and_is_labelled_by_the_physics(run, tmp_path):
-    groups = real_groups(run, run.policy("sft"), DRAW, tmp_path)
-    dreams = dreamt_groups(run, run.policy("sft"), run.world_model(), groups, 1.0, seed=0)
+    groups, folder = real_groups(run, run.policy("sft"), DRAW, tmp_path), tmp_path / "dreams"
+    dreams = dreamt_groups(run, run.policy("sft"), run.world_model(), groups, DRAW, folder)
     assert torch.equal(dreams.context_id, groups.context_id) and torch.equal(dreams.task_id, groups.task_id)
     rows, first, later = torch.arange(8), torch.tensor(0), torch.tensor(5)
     lived, dreamt = groups.episodes, dreams.episodes
@@ -117,8 +117,14 @@ def test_what_is_dreamt_begins_where_the_groups_do_and_is_labelled_by_the_physic
     assert torch.equal(dreamt["success"], relive(run, dreamt))
     actions = dreams.grouped(dreamt["actions"])
     assert (actions[:, 0] != actions[:, 1]).flatten(1).any(1).all()  # of a group, too
-    again = dreamt_groups(run, run.policy("sft"), run.world_model(), groups, 1.0, seed=0)
-    assert torch.equal(again.episodes["actions"], dreamt["actions"])
+    before = (folder / "dreams.mcap").stat().st_mtime_ns
+    for overwrite in (False, True):
+        again = dreamt_groups(run, run.policy("sft"), run.world_model(), groups, DRAW, folder, overwrite).episodes
+        assert torch.equal(again["actions"], dreamt["actions"])
+        assert torch.equal(again.frames("agentview", rows, later), dreamt.frames("agentview", rows, later))
+        assert ((folder / "dreams.mcap").stat().st_mtime_ns != before) == overwrite
+    with pytest.raises(ValueError, match="were drawn with another world_model"):
+        dreamt_groups(run, run.policy("sft"), make_world_model(run.config), groups, DRAW, folder)
 
 
 def test_groups_that_end_in_another_order_are_put_in_theirs(run, tmp_path):
