@@ -206,7 +206,8 @@ def _memory(kind: str, config: WorldEnvConfig, found: Rehearsal, machine: Machin
         pixels = len(config.sft.cameras or config.cameras) * 3 * config.image_size**2
         part = min(rows(settings.minibatch_size), rows_at_once(pixels, machine.kind))
         lived = max(videos * calls["decide"].activation_bytes, imagined(videos) if dreamed else 0.0)
-        held = [Held(sizes["policy"], learns=True, averaged=True), *dreaming]
+        before = [Held(sizes["policy"])] if settings.hold else []
+        held = [Held(sizes["policy"], learns=True, averaged=True), *before, *dreaming]
         return held, max(lived, part * calls["update"].activation_bytes)
     if kind == "evaluate":
         batch = rows(config.evaluate.num_envs)

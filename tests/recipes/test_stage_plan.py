@@ -115,6 +115,13 @@ def test_memory_of_the_stages():
     ]  # fmt: skip
 
 
+def test_holding_keeps_the_policy_as_it_was_beside_the_one_that_learns():
+    holding = dataclasses.replace(CONFIG, post_train=dataclasses.replace(CONFIG.post_train, hold=1.0))
+    held, plain = ({stage.name: stage for stage in stage_plans(each, found(), GPUS)} for each in (holding, CONFIG))
+    assert held["post_train"].whole_bytes - plain["post_train"].whole_bytes == 400
+    assert held["sft"] == plain["sft"]
+
+
 def test_bytes_that_a_gpu_sends():
     moved = moved_bytes(CONFIG, found(), GPUS)
     updates = 2 * 2  # sixteen decisions twice, eight at a time
@@ -131,6 +138,12 @@ def test_a_stage_that_is_too_large_is_a_line_with_the_settings_that_help():
     (line,) = too_large(plans, dataclasses.replace(GPUS, memory=350.0))
     assert line.startswith("post_train takes ") and "sharded over 4 GPUs, a GPU has" in line
     assert "less of --post-train.minibatch-size" in line and line.endswith("or more --gpus")
+
+
+def test_every_stage_of_a_gpu_may_be_too_large():
+    plans = stage_plans(dataclasses.replace(CONFIG, adapt=settings.Adapt(steps=10)), found(), GPUS)
+    lines = too_large(plans, dataclasses.replace(GPUS, memory=0.0))
+    assert [line.split()[0] for line in lines] == [stage.name for stage in plans[1:]]  # the expert needs none
 
 
 @pytest.mark.parametrize("rounds", [1, 2])
