@@ -181,6 +181,9 @@ class PostTrain:
     lora_lr: float = 2e-4
     """Of the adapters, or of the rest of the policy at rank 0; at 0 the heads alone are updated."""
     head_lr: float = 2e-4
+    draw: int = 0
+    """Another one gives LOOP other random numbers, and leaves the rest of the run as it is: how much of a result is
+    chance."""
     averaging: float = 0.8
     """Decay per iteration of the running mean of the weights that is saved."""
     source_share: float = 0.0
@@ -262,6 +265,9 @@ class WorldEnvConfig:
     """Folder of checkpoints, rollouts, metrics and plots; the same command on the same folder continues."""
     seed: int = 0
     """Of every random choice; demonstrations and initial states stay the same."""
+    begin_from: Path | None = None
+    """Another run's folder: a new run begins with copies of the stages that are finished there, up to the first that
+    depends on a setting which is another one here."""
     num_threads: int = 2
     """CPU threads. Beside other jobs 1 is faster: threads that wait for a busy core make all wait."""
     device: str = "auto"

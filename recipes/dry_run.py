@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import torch
 
+from beginning import beginning
 from checks import check_config
 from command_line import expected, in_options
 from config import WorldEnvConfig
@@ -21,7 +22,9 @@ from libero_files import told, with_files
 from parts import COMPACT, Parts
 from real_parts import parts_of
 from rehearsal import Rehearsal, rehearse
+from run_folder import RunFolder
 from stage_plan import Machine, StagePlan, decisions, iteration_flops, moved_bytes, stage_plans, wave_bytes
+from stages import plan
 
 _HERE = "here"
 _TITLES = {"policy": "policy", "world_model": "world model", "reflector": "reflector"}
@@ -31,6 +34,7 @@ _SMALLER = {
     "explore": "--explore.num-envs",
     "train_world_model": "--world-model.batch-size, --real-size.frame-size",
     "train_reflector": "--real-size.rows-per-call, --real-size.num-frames",
+    "adapt": "--adapt.batch-size, --post-train.lora-rank, --real-size.rows-per-call",
     "post_train": "--post-train.minibatch-size, --post-train.groups, --post-train.lora-rank, --real-size.rows-per-call",
     "evaluate": "--evaluate.num-envs",
 }
@@ -61,6 +65,7 @@ def dry_run(config: WorldEnvConfig, chosen: argparse.Namespace, parts: Parts | N
         # Whether this machine has the run's device says nothing of another one; the parts are built below.
         bare = replace(parts, **{name: replace(getattr(parts, name), outline=None) for name in _TITLES})
         check_config(replace(config, device="cpu"), bare)
+        begun = beginning(config, plan(config), RunFolder(config.run_dir))
     except Exception as error:
         if not expected(error):
             raise
@@ -69,12 +74,13 @@ def dry_run(config: WorldEnvConfig, chosen: argparse.Namespace, parts: Parts | N
     found = rehearse(config, parts, published)
     for name in published:
         print(f"{_TITLES[name]}: no folder named (--real-size.{name.replace('_', '-')}), of published sizes")
-    for line in (*told(config), *found.shapes):
+    for line in (*told(config), *found.shapes, *([str(begun)] if begun else [])):
         print(line)
     if found.problems:
         return _refused(found.problems)
     _show_parts(found)
-    plans = stage_plans(config, found, machine)
+    taken = {stage.name for stage in begun.stages} if begun else set()
+    plans = [stage for stage in stage_plans(config, found, machine) if stage.name not in taken]
     _show_stages(plans, machine)
     _show_iteration(config, found, machine)
     for stage in plans:

@@ -22,6 +22,7 @@ from physics import exploring_actor, recording
 from probes import probe, probed_iterations, warning
 from resumable import Resumable
 from run import Run
+from seeds import another_draw
 from stages import run_alone
 from updates import PATIENCE, STUCK, rate_factor, ratios, stuck, update
 from waves import Waves
@@ -56,7 +57,7 @@ def post_train(
     """
     config, settings = run.config, run.config.post_train
     hold = Hold(run, source, models) if settings.hold else None
-    run.seed_everything(target)
+    run.seed_everything(target, another_draw(settings.draw))
     policy = run.policy(source)
     groups = policy.post_training_parameters(settings.lora_rank)
     rates = {name: settings.head_lr if name == "heads" else settings.lora_lr for name in groups}

@@ -97,6 +97,7 @@ RANGES: dict[str, Range] = {
     "post_train.lora_lr": _WEIGHT,
     "post_train.head_lr": _RATE,
     "post_train.averaging": _SHARE,
+    "post_train.draw": _ZERO,
     "post_train.hold": _WEIGHT,
     "post_train.hold_from": _SHARE,
     "post_train.source_share": _SHARE,

@@ -86,9 +86,9 @@ class Run:
         """Of one use of random numbers in a stage; see :func:`seeds.stage_seed`."""
         return stage_seed(self.config.seed, stage, use)
 
-    def seed_everything(self, stage: str) -> None:
+    def seed_everything(self, stage: str, use: str = "") -> None:
         """Each stage has its own stream, so a stage run alone draws the same numbers as in the whole loop."""
-        torch.manual_seed(self.seed(stage))
+        torch.manual_seed(self.seed(stage, use))
 
     def policy(self, name: str) -> Policy:
         stage = {"sft": "sft", "adapted": "adapt"}.get(name.split("_")[0], "post_train")

@@ -3,9 +3,9 @@
 ``checkpoints/`` learned parts, ``rollouts/*.mcap`` logged rollouts, ``episodes/`` their frames on disk (a cache),
 ``metrics.jsonl`` one line a measurement, ``plots/*.png``, ``config.yaml`` the exact settings, ``tasks.json`` the
 digest of each task, ``versions.json`` the packages it ran with, ``stages/`` one marker per finished stage,
-``report.html``, ``logs/`` what ``--logger`` adds, ``error.txt`` the traceback of the last error of a stage; while a
-stage runs, ``resume/<stage>/`` from where it would continue (:mod:`resumable`) and ``scratch/``. ``run.lock`` keeps a
-second run out.
+``report.html``, ``logs/`` what ``--logger`` adds, ``error.txt`` the traceback of the last error of a stage,
+``begun.json`` whose stages it began with (:mod:`beginning`); while a stage runs, ``resume/<stage>/`` from where it
+would continue (:mod:`resumable`) and ``scratch/``. ``run.lock`` keeps a second run out.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import shutil
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,18 @@ from loggers import Loggers
 from worldenv_trl.report import machine_versions, read_metrics
 
 MIN_FREE_GB = 1.0
-FREE = {"run_dir", "num_threads", "device", "parallel", "collectors", "checkpoint_minutes", "logger"}
-"""Settings of the machine at hand: a run may be continued with others. Only ``device`` and ``collectors`` (``local`` or
-shares, and how many) change noise and rounding."""
+FREE = {
+    "run_dir",
+    "num_threads",
+    "device",
+    "parallel",
+    "collectors",
+    "checkpoint_minutes",
+    "logger",
+    "begin_from",
+}
+"""Settings of the machine at hand, and where a run began: it may be continued with others. Only ``device`` and
+``collectors`` (``local`` or shares, and how many) change noise and rounding."""
 
 
 class RunFolder:
@@ -111,13 +120,19 @@ class RunFolder:
             raise FileNotFoundError(f"{path} does not exist: run the stage {stage!r} on this folder first")
         return path
 
-    def open(self, config: Any, tasks: dict[str, str] | None = None) -> None:
+    @property
+    def is_new(self) -> bool:
+        """Whether no run has been opened here yet."""
+        return not (self.path / "config.yaml").exists()
+
+    def open(self, config: Any, tasks: dict[str, str] | None = None, begin: Callable[[], None] | None = None) -> None:
         """Creates the folder, or checks that the one found was made with the same settings and tasks, and locks it for
         this process, until it ends or this object is gone. Reading needs no lock.
 
         Args:
             config: the settings, a dataclass.
             tasks: digest of each task, by name.
+            begin: called in a new folder before it counts as one: interrupted it is called again.
 
         Raises:
             ValueError: if ``config.yaml`` exists and differs, naming the first settings that do, or a task has changed;
@@ -127,7 +142,6 @@ class RunFolder:
         """
         if not processes.is_main():
             return
-        new = _plain(dataclasses.asdict(config))
         self.path.mkdir(parents=True, exist_ok=True)
         self._lock = lock_folder(self.path)
         free_gb = shutil.disk_usage(self.path).free / 1e9
@@ -137,9 +151,7 @@ class RunFolder:
             )
         stored = self.path / "config.yaml"
         if stored.exists():
-            old = _read(stored, yaml.safe_load)
-            # What has become a setting since then was at its default.
-            before, now = _flat(_plain(dataclasses.asdict(type(config)()))) | _flat(old), _flat(new)
+            before, now = stored_settings(stored, type(config)), settings_of(config)
             changed = [key for key in now if before.get(key) != now[key] and key not in FREE]
             if changed:
                 key, more = changed[0], f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
@@ -149,21 +161,22 @@ class RunFolder:
                 )
         for name in ("checkpoints", "rollouts", "plots", "stages"):
             (self.path / name).mkdir(exist_ok=True)
-        _write_atomically(stored, yaml.safe_dump(new, sort_keys=False))
+        if begin is not None and self.is_new:
+            begin()
+        _write_atomically(stored, yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False))
         self._note_versions()
         self._note_tasks(tasks or {})
 
     def _note_tasks(self, tasks: dict[str, str]) -> None:
         """Notes the digests of the tasks in ``tasks.json``, once."""
-        path = self.path / "tasks.json"
-        noted = _read(path, json.loads) if path.exists() else {}
+        noted = self.noted("tasks")
         changed = [task for task, digest in tasks.items() if noted.get(task, digest) != digest]
         if changed:
             raise ValueError(
                 f"{changed[0]} has changed since {self.path} was made: use another --run-dir, or the file as it was"
             )
         if tasks and not noted:
-            _write_atomically(path, json.dumps(tasks, indent=1) + "\n")
+            self.note("tasks", tasks)
 
     def _note_versions(self) -> None:
         """Adds what runs now to ``versions.json`` if it is not what ran last."""
@@ -185,6 +198,34 @@ class RunFolder:
             return
         shutil.rmtree(self.progress(stage), ignore_errors=True)
         (self.path / "stages" / stage).unlink(missing_ok=True)
+
+    def take_over(self, source: RunFolder, stages: Mapping[str, Iterable[str]]) -> None:
+        """Copies what finished stages of another run have left, and marks them finished here.
+
+        Args:
+            source: the other run's folder.
+            stages: the files and folders of each, as patterns under it.
+        """
+        for patterns in stages.values():
+            for path in (path for pattern in patterns for path in source.path.glob(pattern)):
+                copy = self.path / path.relative_to(source.path)
+                if path.is_dir():
+                    shutil.copytree(path, copy, dirs_exist_ok=True)
+                else:
+                    shutil.copy2(path, copy)
+        lines = [line for line in source.read_metrics() if line["stage"] in stages]
+        _write_atomically(self.metrics_path, "".join(json.dumps(line) + "\n" for line in lines))
+        for name in stages:
+            shutil.copy2(source.path / "stages" / name, self.path / "stages" / name)
+
+    def note(self, name: str, values: Mapping[str, Any]) -> None:
+        """Writes ``<name>.json``."""
+        _write_atomically(self.path / f"{name}.json", json.dumps(_plain(values), indent=1) + "\n")
+
+    def noted(self, name: str) -> dict[str, Any]:
+        """What :meth:`note` wrote, nothing if it never did; raises ``ValueError`` if it is damaged."""
+        path = self.path / f"{name}.json"
+        return _read(path, json.loads) if path.exists() else {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -264,6 +305,16 @@ class RunFolder:
             return []
         lines = read_metrics(self.path)
         return [line for line in lines if stage in (None, line["stage"])]
+
+
+def settings_of(config: Any) -> dict[str, Any]:
+    """All settings of a dataclass of them by their dotted names, as ``config.yaml`` holds them."""
+    return _flat(_plain(dataclasses.asdict(config)))
+
+
+def stored_settings(path: Path, kind: type) -> dict[str, Any]:
+    """Those in a ``config.yaml``; what has become a setting of ``kind`` since then was at its default."""
+    return settings_of(kind()) | _flat(_read(path, yaml.safe_load))
 
 
 def _read(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:

@@ -24,3 +24,8 @@ def stage_seed(seed: int, stage: str, use: str = "") -> int:
     """
     digest = hashlib.sha256(json.dumps([seed, stage, use]).encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1
+
+
+def another_draw(draw: int, use: str = "") -> str:
+    """A use of random numbers, told from the same of other draws; the first one, 0, is the use alone."""
+    return f"{use} (draw {draw})" if draw else use

@@ -16,6 +16,7 @@ import tyro
 from tqdm import tqdm
 
 import processes
+from beginning import beginning
 from checks import check_config, check_shares
 from command_line import expected, in_options, refusals
 from config import PRESETS, WorldEnvConfig
@@ -157,7 +158,11 @@ def _check_and_open(config: WorldEnvConfig, parts: Parts, folder: RunFolder, cou
     check_config(config, parts)
     check_shares(config, count)
     check_made_of(config, parts, folder)
-    folder.open(config, {task: load_task(task).digest for task in config.tasks})
+    begun = beginning(config, plan(config), folder)
+    if begun is not None:
+        check_made_of(config, parts, begun.source)
+    tasks = {task: load_task(task).digest for task in config.tasks}
+    folder.open(config, tasks, begin=None if begun is None else lambda: begun.copy_to(folder))
     folder.start_logging(config)
 
 

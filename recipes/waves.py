@@ -17,6 +17,7 @@ from collecting import of_worker
 from imagination import Imagination, frames_aside
 from physics import physics_waves_env
 from run import Run
+from seeds import another_draw
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
 from worldenv_trl.envs import FramesAside
@@ -53,7 +54,7 @@ class Waves:
     def __init__(self, run: Run, target: str, models: str, actor: LaplaceActor | AutoregressiveActor) -> None:
         settings, size = run.config.post_train, run.config.post_train.group_size
         self._groups, self._read = settings.groups // processes.size(), [*actor.policy.in_keys, *_LEARNED_FROM]
-        self._workers, seed = run.workers is not None, run.seed(target, "env")
+        self._workers, seed = run.workers is not None, run.seed(target, another_draw(settings.draw, "env"))
         self.judges: dict[str, Any] = {}
         make: Callable[..., EnvBase]
         if settings.env == "imagined":

@@ -164,3 +164,11 @@ def test_the_versions_of_the_run_are_shown_beside_those_of_the_report(finished, 
     assert all(words in page for words in ("1.2.3", "2.3.4", "continued with", "this report"))
     (run / "versions.json").unlink()
     assert "did not note its versions" in report_of(run, models=False)
+
+
+def test_it_says_whose_stages_a_run_began_with(finished, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    assert "Taken over" not in report_of(run, models=False)
+    (run / "begun.json").write_text(json.dumps({"run": "/of/<others>", "stages": ["demonstrate", "sft"]}))
+    assert "Taken over from /of/&lt;others&gt;: demonstrate, sft." in report_of(run, models=False)

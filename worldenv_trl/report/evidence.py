@@ -125,6 +125,8 @@ class RunRecord:
     seconds: dict[str, float]
     run_versions: tuple[dict[str, str], ...] = ()
     """What the run began with and, where they differ, what continued it; ``versions`` are this machine's."""
+    begun: dict[str, Any] = field(default_factory=dict)
+    """The ``run`` whose ``stages`` it began with; empty for a run of its own."""
 
     @classmethod
     def read(cls, path: str | Path) -> RunRecord:
@@ -151,7 +153,9 @@ class RunRecord:
             raise ValueError(
                 f"{path / 'config.yaml'} holds no settings ({config}); the run that wrote it can write it again"
             )
-        return cls(path, lines, config, machine_versions(), seconds, _noted_versions(path))
+        begun = _noted(path / "begun.json")
+        begun = begun if isinstance(begun, dict) else {}
+        return cls(path, lines, config, machine_versions(), seconds, _noted_versions(path), begun)
 
     def series(self, stage: str, key: str) -> tuple[list[float], list[float]]:
         """Steps and values of a logged quantity."""
@@ -162,11 +166,15 @@ class RunRecord:
         return [name for name in dict.fromkeys(line["stage"] for line in self.lines) if name.startswith(prefix)]
 
 
-def _noted_versions(path: Path) -> tuple[dict[str, str], ...]:
+def _noted(path: Path) -> Any:
     try:
-        noted = json.loads((path / "versions.json").read_text())
-    except (OSError, ValueError):  # of a run before they were noted
-        return ()
+        return json.loads(path.read_text())
+    except (OSError, ValueError):  # of a run before it was noted
+        return None
+
+
+def _noted_versions(path: Path) -> tuple[dict[str, str], ...]:
+    noted = _noted(path / "versions.json")
     return tuple(each for each in noted if isinstance(each, dict)) if isinstance(noted, list) else ()
 
 

@@ -211,13 +211,23 @@ def settings(record: RunRecord, evidence: Evidence | None) -> str:
         table(("stage", "time", "share"), stages) if stages else missing("No stage has run yet."),
         "</div><div><h3>Versions</h3>",
         _versions(record),
-        "</div></div><h3>Config</h3>",
+        "</div></div>",
+        _begun(record),
+        "<h3>Config</h3>",
         f'<pre tabindex="0">{escape(yaml.safe_dump(record.config, sort_keys=False))}</pre>',
     ]
     if evidence and evidence.notes:
         notes = "".join(f"<li>{escape(note)}</li>" for note in evidence.notes)
         parts.append(f"<h3>How this was measured</h3><ul>{notes}</ul>")
     return section("config", "Config and versions", "What was run, and for how long.", *parts)
+
+
+def _begun(record: RunRecord) -> str:
+    """Of whose stages it began with."""
+    if not record.begun:
+        return ""
+    names = ", ".join(escape(str(name)) for name in record.begun.get("stages", ()))
+    return f"<p>Taken over from {escape(str(record.begun.get('run')))}: {names}.</p>"
 
 
 def _versions(record: RunRecord) -> str:

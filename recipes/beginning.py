@@ -1,0 +1,125 @@
+"""A run that begins with what another one has finished: ``--begin-from RUN``.
+
+The new folder gets copies of RUN's checkpoints, recordings and figures of all stages up to the first that depends on a
+setting which is another one here; from there on it runs by itself. So what LOOP makes of other settings is compared in
+one pair of models, and no folder mixes settings. ``begun.json`` says what came from where.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from config import WorldEnvConfig
+from run_folder import FREE, RunFolder, settings_of, stored_settings
+from worldenv_trl.scenes import load_task
+
+if TYPE_CHECKING:
+    from stages import Stage
+
+_ANYWHERE = FREE | {"rounds"}  # later rounds leave the earlier ones as they are
+DEPENDS_ON: dict[str, tuple[str, ...]] = {
+    "demonstrate": ("demonstrate",),
+    "sft": ("sft", "real_size"),
+    "explore": ("explore", "scale_floor", "scale_share", "post_train.ratio_level"),
+    "train_world_model": ("world_model",),
+    "train_reflector": ("reflector",),
+    "adapt": ("adapt", "post_train.lora_rank", "post_train.scale_factor"),
+    "post_train": ("adapt", "post_train", "scale_floor", "scale_share", "evaluate.num_envs"),
+}
+"""Settings, or sections of them, that a kind of stage depends on besides those of the stages before it and those of the
+whole run: its tasks, seed, cameras and so on."""
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What a new run takes over."""
+
+    source: RunFolder
+    stages: tuple[Stage, ...]
+    why: str
+    """No more than these."""
+
+    def copy_to(self, folder: RunFolder) -> None:
+        folder.take_over(self.source, {stage.name: _left_by(stage) for stage in self.stages})
+        names = [stage.name for stage in self.stages]
+        folder.note("begun", {"run": str(self.source.path.resolve()), "stages": names})
+        print(self)
+
+    def __str__(self) -> str:
+        names = ", ".join(stage.name for stage in self.stages)
+        return f"{names}: as in {self.source.path}" + (f" ({self.why})" if self.why else "")
+
+
+def beginning(config: WorldEnvConfig, stages: Sequence[Stage], folder: RunFolder) -> Beginning | None:
+    """What ``folder`` would take over from ``begin_from``; None for a run that has begun, or where nothing is named.
+
+    Args:
+        config: of the run.
+        stages: its plan.
+        folder: its folder; nothing is written.
+
+    Raises:
+        FileNotFoundError: if ``begin_from`` is no run folder.
+        ValueError: if it is the run's own folder, or the run there has begun otherwise; if nothing can be taken from
+            it, and why.
+    """
+    if config.begin_from is None:
+        return None
+    source = RunFolder(config.begin_from)
+    if source.is_new:
+        raise FileNotFoundError(f"begin_from: {source.path} is no run folder, it holds no config.yaml")
+    if source.path.resolve() == folder.path.resolve():
+        raise ValueError(f"begin_from is the run_dir itself, {source.path}: name a new folder for the run")
+    if not folder.is_new:
+        if folder.noted("begun").get("run") != str(source.path.resolve()):
+            raise ValueError(
+                f"{folder.path} holds a run that did not begin with {source.path}: use another --run-dir, or leave "
+                "begin_from out"
+            )
+        return None
+    taken, why = stages_in_common(config, stages, source)
+    if not taken:
+        raise ValueError(f"begin_from: nothing of {source.path} can be taken, for {why}")
+    return Beginning(source, tuple(taken), why)
+
+
+def stages_in_common(config: WorldEnvConfig, stages: Sequence[Stage], source: RunFolder) -> tuple[list[Stage], str]:
+    """The first stages, finished in ``source``, of which all that they depend on is the same there, and why no more.
+    What evaluates is never among them."""
+    before, now, noted = _stored(source), settings_of(config), source.noted("tasks")
+    for task in config.tasks:
+        if noted.get(task) not in (None, load_task(task).digest):
+            return [], f"{task} has changed since it was made"
+    different = [name for name in now if before.get(name) != now[name]]
+    taken: list[Stage] = []
+    read = _of_the_run(now)
+    for stage in (stage for stage in stages if stage.kind != "evaluate"):
+        read |= set(DEPENDS_ON[stage.kind])
+        if stage.kind == "sft" and config.parts == "real-size":
+            read.add("post_train.lora_rank")  # of adapters that these parts are made with
+        changed = [name for name in different if name in read or name.split(".")[0] in read]
+        if changed:
+            name = changed[0]
+            return taken, f"{stage.name} is of {name}={before.get(name)!r} there and {now[name]!r} here"
+        if not source.done(stage.name) or not (source.path / stage.makes).exists():
+            return taken, f"{stage.name} is not finished there"
+        taken.append(stage)
+    return taken, ""
+
+
+def _of_the_run(settings: Mapping[str, Any]) -> set[str]:
+    """Settings that every stage depends on: those of no stage."""
+    of_stages = {name.split(".")[0] for names in DEPENDS_ON.values() for name in names} | {"evaluate"}
+    return {name for name in settings if "." not in name and name not in of_stages | _ANYWHERE}
+
+
+def _left_by(stage: Stage) -> list[str]:
+    """Patterns of what a stage leaves, and the iterations of LOOP that were recorded."""
+    recorded = [f"rollouts/{stage.name}_[0-9][0-9][0-9]*.mcap"] if stage.kind == "post_train" else []
+    return [stage.makes, *recorded]
+
+
+def _stored(source: RunFolder) -> dict[str, Any]:
+    return stored_settings(source.path / "config.yaml", WorldEnvConfig)
