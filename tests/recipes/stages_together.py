@@ -24,6 +24,7 @@ from small_run import SMALL
 import config
 import updates
 from data_parallel import DataParallel
+from holding import Hold
 from post_train import post_train
 from stages import open_run, rerun
 from world_env import WORKS
@@ -34,6 +35,7 @@ SETTINGS = dataclasses.replace(
     device="cpu",
     checkpoint_minutes=1000.0,
     sft=config.SFT(steps=20, scale_steps=5, batch_size=8),
+    explore=dataclasses.replace(SMALL.explore, scale_factors=(1.0, 0.0)),
     world_model=config.WorldModel(steps=20, batch_size=2, lr=5e-4),
     reflector=config.Reflector(encoder_steps=20, steps=20, batch_size=4),
     adapt=config.Adapt(steps=20, episodes_per_task=4, batch_size=8),
@@ -44,12 +46,24 @@ SETTINGS = dataclasses.replace(
 
 
 def learn(run, **options) -> None:
-    """LOOP on returns that differ by more than rounding, which an untrained reflector's do not."""
+    """LOOP on returns that differ by more than rounding, which an untrained reflector's do not; holding, if anything,
+    every other context: there is one task alone."""
+    refer = Hold.refer
+
+    def every_other(hold, wave):
+        return wave[keys.CONTEXT_ID][:, 0, 0, 0] % 2 == 0
+
+    def elsewhere(hold, decisions):
+        """Where a mean is where it is held, the gradient of its distance has the sign of rounding."""
+        refer(hold, decisions)
+        decisions[keys.REFERENCE_LOC] += decisions[keys.REFERENCE_SCALE]
 
     def returns_of(wave):
         return wave[keys.CHUNK][..., :3].mean((-1, -2, -3)) + wave["next", keys.STEP_MASK].float().mean((-1, -2))
 
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Hold, "groups", every_other)
+        patch.setattr(Hold, "refer", elsewhere)
         patch.setattr(updates, "_PIXELS", 1)  # sixteen decisions at once: a share takes one turn or two
         # Advantages of a group sum to zero, so a gradient of what all its rows share is rounding, which differs from
         # CPU to CPU, and Adam would divide it by its own size.

@@ -28,6 +28,7 @@ STAGES = {
     "post_train": "post_train",
 }
 PHYSICS = {"post_train": {"env": "tabletop", "iterations": 2, "probe_every": 0}}
+HOLDING = {"post_train": {"hold": 1.0, "iterations": 3, "probe_every": 0}}
 
 
 def torchrun(jobs: list[dict], seconds: float = 400.0) -> subprocess.CompletedProcess:
@@ -70,8 +71,9 @@ def two(one, tmp_path_factory, request):
         {"run": str(copy_of(one, root / kind, stage)), "kind": kind, "settings": {"parallel": request.param}}
         for kind, stage in STAGES.items()
     ]
-    physics = copy_of(one, root / "physics", "post_train", PHYSICS)
-    jobs.append({"run": str(physics), "kind": "post_train", "settings": PHYSICS | {"parallel": request.param}})
+    for name, settings in (("physics", PHYSICS), ("holding", HOLDING)):
+        run = copy_of(one, root / name, "post_train", settings)
+        jobs.append({"run": str(run), "kind": "post_train", "settings": settings | {"parallel": request.param}})
     done = torchrun(jobs)
     assert done.returncode == 0, done.stderr[-4000:]
     assert "find_unused_parameters" not in done.stderr  # torch's warning, once a process, where nothing is unused
@@ -142,6 +144,17 @@ def test_loop_in_the_physics_is_lived_by_one_and_learned_by_both(one, two, tmp_p
     assert furthest(weights(alone, "post_train"), weights(two / "physics", "post_train")) < 1e-5
     rows = [json.loads((two / "physics" / f"rows_{rank}.json").read_text()) for rank in range(2)]
     assert all(144 <= sum(each) <= 144 + each.count(1) for each in rows)
+
+
+def test_what_one_process_holds_two_hold(one, two, tmp_path):
+    alone, free = (copy_of(one, tmp_path / name, "post_train", HOLDING) for name in ("held", "free"))
+    work(str(alone), "post_train", HOLDING)
+    work(str(free), "post_train", {"post_train": HOLDING["post_train"] | {"hold": 0.0}})
+    assert furthest(weights(free, "post_train"), weights(alone, "post_train")) > 1e-4
+    assert furthest(weights(alone, "post_train"), weights(two / "holding", "post_train")) < 1e-5
+    held = [line["held_groups"] for line in lines(two / "holding", "post_train") if "held_groups" in line]
+    assert held == [line["held_groups"] for line in lines(alone, "post_train") if "held_groups" in line]
+    assert len(held) == 3 and 0 < sum(held) < 3
 
 
 @pytest.mark.parametrize(
