@@ -88,7 +88,8 @@ def beginning(config: WorldEnvConfig, stages: Sequence[Stage], folder: RunFolder
 def stages_in_common(config: WorldEnvConfig, stages: Sequence[Stage], source: RunFolder) -> tuple[list[Stage], str]:
     """The first stages, finished in ``source``, of which all that they depend on is the same there, and why no more.
     What evaluates is never among them."""
-    before, now, noted = _stored(source), settings_of(config), source.noted("tasks")
+    before = stored_settings(source.path / "config.yaml", type(config))
+    now, noted = settings_of(config), source.noted("tasks")
     for task in config.tasks:
         if noted.get(task) not in (None, load_task(task).digest):
             return [], f"{task} has changed since it was made"
@@ -119,7 +120,3 @@ def _left_by(stage: Stage) -> list[str]:
     """Patterns of what a stage leaves, and the iterations of LOOP that were recorded."""
     recorded = [f"rollouts/{stage.name}_[0-9][0-9][0-9]*.mcap"] if stage.kind == "post_train" else []
     return [stage.makes, *recorded]
-
-
-def _stored(source: RunFolder) -> dict[str, Any]:
-    return stored_settings(source.path / "config.yaml", WorldEnvConfig)

@@ -200,7 +200,8 @@ class RunFolder:
         (self.path / "stages" / stage).unlink(missing_ok=True)
 
     def take_over(self, source: RunFolder, stages: Mapping[str, Iterable[str]]) -> None:
-        """Copies what finished stages of another run have left, and marks them finished here.
+        """Copies what finished stages of another run have left, and what made them (``versions.json``); marks them
+        finished here.
 
         Args:
             source: the other run's folder.
@@ -213,6 +214,8 @@ class RunFolder:
                     shutil.copytree(path, copy, dirs_exist_ok=True)
                 else:
                     shutil.copy2(path, copy)
+        if (source.path / "versions.json").exists():
+            shutil.copy2(source.path / "versions.json", self.path / "versions.json")
         lines = [line for line in source.read_metrics() if line["stage"] in stages]
         _write_atomically(self.metrics_path, "".join(json.dumps(line) + "\n" for line in lines))
         for name in stages:

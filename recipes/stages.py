@@ -157,18 +157,18 @@ def open_run(config: WorldEnvConfig, parts: Parts | None = None) -> Run:
 def _check_and_open(config: WorldEnvConfig, parts: Parts, folder: RunFolder, count: int) -> None:
     check_config(config, parts)
     check_shares(config, count)
-    check_made_of(config, parts, folder)
+    check_made_of(plan(config), parts, folder)
     begun = beginning(config, plan(config), folder)
     if begun is not None:
-        check_made_of(config, parts, begun.source)
+        check_made_of(begun.stages, parts, begun.source)
     tasks = {task: load_task(task).digest for task in config.tasks}
     folder.open(config, tasks, begin=None if begun is None else lambda: begun.copy_to(folder))
     folder.start_logging(config)
 
 
-def check_made_of(config: WorldEnvConfig, parts: Parts, folder: RunFolder) -> None:
-    """Raises ``ValueError`` if a checkpoint of one of the run's stages is of a class that ``parts`` do not load."""
-    for stage in (stage for stage in plan(config) if stage.kind in _MAKES):
+def check_made_of(stages: Sequence[Stage], parts: Parts, folder: RunFolder) -> None:
+    """Raises ``ValueError`` if a checkpoint of one of the stages is of a class that ``parts`` do not load."""
+    for stage in (stage for stage in stages if stage.kind in _MAKES):
         name, made = _MAKES[stage.kind], saved_class(folder.path / stage.makes)
         known = getattr(parts, name).known
         if known and made is not None and made not in known:

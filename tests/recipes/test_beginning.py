@@ -137,6 +137,28 @@ def test_where_nothing_can_come_over_it_says_why_and_begins_nothing(whole, tmp_p
     assert not settings.run_dir.exists()
 
 
+def test_only_the_parts_that_come_over_must_be_known(whole, tmp_path):
+    source = tmp_path / "source"
+    shutil.copytree(whole[0].run_dir, source)
+    settings = changed(whole[0], run_dir=tmp_path / "new", begin_from=source, post_train__draw=1)
+    for name in ("post_train", "adapted"):
+        (source / "checkpoints" / name / "config.json").write_text(json.dumps({"class": "OtherPolicy"}))
+        if name == "post_train":
+            open_run(changed(settings, run_dir=tmp_path / "without")).close()
+    with pytest.raises(SystemExit, match="adapted holds OtherPolicy, and the run's policy is OFTPolicy now"):
+        open_run(settings)
+
+
+def test_the_versions_that_made_it_are_kept(whole, tmp_path):
+    source = tmp_path / "source"
+    shutil.copytree(whole[0].run_dir, source)
+    (source / "versions.json").write_text(json.dumps([{"torch": "1.2.3"}]))
+    settings = changed(whole[0], run_dir=tmp_path / "new", begin_from=source)
+    open_run(settings).close()
+    made, now = json.loads((settings.run_dir / "versions.json").read_text())
+    assert made == {"torch": "1.2.3"} and now["torch"] != "1.2.3"
+
+
 def test_an_unfinished_stage_does_not_come_over(whole, tmp_path):
     source = tmp_path / "source"
     shutil.copytree(whole[0].run_dir, source)
