@@ -138,6 +138,9 @@ class Reflector:
     0. Half as many come before, in which it finds the places that matter there. The first one then judges real frames
     alone, and no imagined episodes are made for it. A batch is shared by the tasks: ten want three times what three
     do."""
+    blind: bool = False
+    """It is not told how a hand goes on once that can see what it has done (``PathReflector``'s ``blind_frames``, a
+    chunk): in the world that betrays how a rollout ends, in imagination it says nothing."""
     holdout: float = 0.2
     """Share of the exploration's initial states kept out, for the figures and for the choice of the stopping rule."""
     threshold: float = 0.5

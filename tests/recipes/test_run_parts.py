@@ -51,3 +51,10 @@ def test_what_a_loader_knows_is_not_guessed(tiny):
     swapped = Part(COMPACT.policy.make, load)
     assert swapped.known == () and COMPACT.world_model.known == ("VideoWorldModel",)
     open_run(tiny, dataclasses.replace(COMPACT, policy=swapped)).close()
+
+
+@pytest.mark.parametrize("blind", [False, True])
+def test_a_blind_judge_is_told_no_more_than_a_chunk_of_how_a_hand_goes_on(tiny, blind):
+    told = dataclasses.replace(tiny.reflector, path_steps=1, blind=blind)
+    reflector = COMPACT.reflector.make(dataclasses.replace(tiny, reflector=told))
+    assert reflector.path.config.blind_frames == (tiny.chunk_length if blind else 0)

@@ -19,7 +19,7 @@ from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.reflectors.base import Lesson, Reflector
 from worldenv_trl.reflectors.goal import MAX_WORDS, Goal
 from worldenv_trl.reflectors.path_lessons import PathLessons, lessons_of
-from worldenv_trl.reflectors.places import KINDS, Places, offsets
+from worldenv_trl.reflectors.places import KINDS, Places, landings, offsets
 from worldenv_trl.robot.camera import Camera
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ class PathReflectorConfig:
         window: side of what is seen around the hand, in shares of the frame's.
         crop_size: pixels (px) that this window is resampled to.
         stride: frames from one look to the next.
+        blind_frames: how long a hand goes on after it has come down before it can answer to what came of that: a
+            policy's chunk. At 0 it may answer at once, and R is read from how it does.
         feature_dim: length of what is seen at a look.
         width: channels of the convolutions over time.
         dropout: while learning.
@@ -57,6 +59,7 @@ class PathReflectorConfig:
     window: float = 0.28
     crop_size: int = 18
     stride: int = 2
+    blind_frames: int = 0
     feature_dim: int = 32
     width: int = 96
     dropout: float = 0.2
@@ -77,6 +80,8 @@ class PathReflectorConfig:
                 "stride, feature_dim, width and members must be at least 1 and crop_size at least 8, got "
                 f"{self.stride}, {self.feature_dim}, {self.width}, {self.members} and {self.crop_size}"
             )
+        if self.blind_frames < 0:
+            raise ValueError(f"blind_frames must be at least 0, got {self.blind_frames}")
         if not 0 < self.window <= 1 or not 0 <= self.dropout < 1:
             raise ValueError(f"window must be in (0, 1] and dropout in [0, 1), got {self.window} and {self.dropout}")
 
@@ -105,8 +110,16 @@ class PathReflector(Reflector, Pretrained):
     they say so far, give R of every prefix. It learns from real rollouts which path fails in which scene, and reads
     nothing that a world model paints, so ghosts of success cannot mislead it; what happens otherwise than commanded it
     does not see either. It must have seen smooth paths fail: where noise alone made them fail, smoothness is what it
-    learns to call success, wherever the hand goes. A hand view is what others predict as a second camera (Ctrl-World,
-    2510.10125); success told for every frame is the reward head of World-VLA-Loop (2602.06508).
+    learns to call success, wherever the hand goes.
+
+    A hand that sees the world answers to what happens there: it goes back for what it missed, or it goes on. Whoever
+    watches real rollouts learns to read that, and reads it where there is nothing to be read: in a dream the hand goes
+    on, whatever it did. With ``blind_frames`` R is the product of two chances: that the goal will be reached, asked of
+    no more of the path than that long after the hand has come down, before it can have answered; and that it is reached
+    by now if it ever is, which is learned from episodes that succeed, and so says when and not whether.
+
+    A hand view is what others predict as a second camera (Ctrl-World, 2510.10125); success told for every frame is the
+    reward head of World-VLA-Loop (2602.06508).
 
     Args:
         config: cameras and sizes.
@@ -201,7 +214,21 @@ class PathReflector(Reflector, Pretrained):
         stride = self.config.stride
         path = self.path(state["poses"][:, ::stride], state["places"])
         logits = self.logits(state["looks"][:, ::stride], path, state["words"])
-        return logits.sigmoid().mean(-1).gather(1, place // stride)
+        chances = logits.sigmoid().mean(2)
+        return self._judged(chances, state["poses"][:, ::stride, :3]).gather(1, place // stride)
+
+    def _judged(self, chances: Tensor, hands: Tensor) -> Tensor:
+        """R [n, L] of what is said at each look, [n, L, A], and hands [n, L, 3]."""
+        if not self.config.blind_frames:
+            return chances[..., 0]
+        look = torch.arange(chances.shape[1], device=hands.device)
+        promised = chances[..., 1].gather(1, torch.minimum(look, self.asked(hands).unsqueeze(-1)))
+        return chances[..., 0] * promised
+
+    def asked(self, hands: Tensor) -> Tensor:
+        """The last look, int64 [n], at which hands [n, L, 3] cannot have answered to what they did: L or more where
+        that is not among them."""
+        return landings(hands) + -(-self.config.blind_frames // self.config.stride)
 
     def moves(self, poses: Tensor) -> Tensor:
         """Poses [n, L, 13], one at each look, and how they changed, normalised: [n, L, 26]."""
@@ -249,7 +276,8 @@ class PathReflector(Reflector, Pretrained):
         return torch.stack([cast(_Member, member).look(crops) for member in self.members], 2)
 
     def logits(self, looks: Tensor, path: Tensor, words: Tensor) -> Tensor:
-        """Log-odds [P, L, M] of every prefix and member.
+        """Log-odds [P, L, M, A] of every prefix and member: that the goal is reached by then; with ``blind_frames``
+        that it is if it ever is, and that it will be.
 
         Args:
             looks: [P, L, M, F], what the members saw at each look.
@@ -257,7 +285,7 @@ class PathReflector(Reflector, Pretrained):
             words: int64 [P, W].
         """
         each = [member(looks[:, :, index], path, words) for index, member in enumerate(self.members)]
-        return torch.stack(each, -1)
+        return torch.stack(each, 2)
 
     # ------------------------------------------------------------------------------------------------- learning
 
@@ -276,25 +304,32 @@ class PathReflector(Reflector, Pretrained):
 
     def training_loss(self, batch: TensorDictBase) -> TensorDict:
         """Of paths the binary cross-entropy of "reached by then", mean over episodes of the mean over looks plus that
-        of the last; of places the divergence of the maps from what they are taught.
+        of the last; with ``blind_frames`` that of episodes which succeed, 0 for the others, and that of "will be
+        reached" at the look where it is asked. Of places the divergence of the maps from what they are taught.
 
         Args:
             batch: [P] of one lesson. Of ``paths``: ``crops`` floats [P, L, 3 V, S, S], ``path`` [P, L, 26 + F],
-                ``words`` int64 [P, W], ``label`` bool [P, L], and ``weight`` [P, L]: 1 up to the episode's end, 0
-                behind it. Of ``places``: ``first`` uint8 [P, V, 3, H, W], ``view`` int64 [P, V], ``words``, ``levels``
-                [P, K] (m) and ``place`` [P, K, 3] (m).
+                ``words`` int64 [P, W], ``label`` bool [P, L], ``asked`` int64 [P], a look, and ``weight`` [P, L]: 1 up
+                to the episode's end, 0 behind it. Of ``places``: ``first`` uint8 [P, V, 3, H, W], ``view`` int64
+                [P, V], ``words``, ``levels`` [P, K] (m) and ``place`` [P, K, 3] (m).
         """
         if "place" in batch.keys():  # noqa: SIM118
             return self._places_loss(batch)
         label, weight = batch["label"].float(), batch["weight"]
         looks = self.look(batch["crops"])
-        logits = self.logits(looks, batch["path"], batch["words"])
+        answers = self.logits(looks, batch["path"], batch["words"])
+        logits = answers[..., 0]
         each = F.binary_cross_entropy_with_logits(logits, label.unsqueeze(-1).expand_as(logits), reduction="none")
         last = (weight.sum(1).long() - 1).clamp(min=0)
         rows = torch.arange(len(last), device=last.device)
-        dense = (each * weight.unsqueeze(-1)).sum(1) / weight.sum(1, keepdim=True)
-        loss = (dense + each[rows, last]).mean(0).sum()  # members learn on their own
-        right = (logits.detach()[rows, last].sigmoid().mean(-1) > 0.5) == (label[rows, last] > 0.5)
+        told = (each * weight.unsqueeze(-1)).sum(1) / weight.sum(1, keepdim=True) + each[rows, last]
+        decides, outcome = logits[rows, last], label[rows, last].unsqueeze(-1)
+        if self.config.blind_frames:
+            decides = answers[rows, torch.minimum(batch["asked"], last), :, 1]
+            promised = F.binary_cross_entropy_with_logits(decides, outcome.expand_as(decides), reduction="none")
+            told = outcome * told + promised
+        loss = told.mean(0).sum()  # members learn on their own
+        right = (decides.detach().sigmoid().mean(-1) > 0.5) == (outcome.squeeze(-1) > 0.5)
         return TensorDict({"loss_reflector": loss, "accuracy": right.float().mean()})
 
     def _places_loss(self, batch: TensorDictBase) -> TensorDict:
@@ -321,7 +356,7 @@ class _Member(nn.Module):
         apart = offsets(torch.zeros(1, 1, 3), torch.zeros(1, KINDS * len(config.cameras), 2)).shape[-1]
         self.into = nn.Linear(config.feature_dim + 2 * POSE_DIM + apart, width)
         self.over_time = nn.ModuleList(_Causal(width, dilation, config.dropout) for dilation in _DILATIONS)
-        self.head = nn.Sequential(nn.Dropout(config.dropout), nn.Linear(3 * width, 1))
+        self.head = nn.Sequential(nn.Dropout(config.dropout), nn.Linear(3 * width, 1 + (config.blind_frames > 0)))
 
     def look(self, crops: Tensor) -> Tensor:
         """Features [P, L, F] of crops [P, L, 3 V, S, S]."""
@@ -336,7 +371,7 @@ class _Member(nn.Module):
             hidden = hidden + layer(hidden)
         count = torch.arange(1, hidden.shape[1] + 1, device=hidden.device).unsqueeze(-1)
         so_far = [hidden, hidden.cumsum(1) / count, hidden.cummax(1).values]
-        return self.head(torch.cat(so_far, -1)).squeeze(-1)
+        return self.head(torch.cat(so_far, -1))
 
 
 class _Causal(nn.Module):

@@ -117,6 +117,7 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
             crops.append(((seen + 0.5) * 255).round().to(torch.uint8))
             points.append(reflector.places(frames, view[here], words[here], levels[here])[1])
     looks, moves, hands, there = torch.cat(crops), reflector.moves(poses), poses[..., :3], torch.cat(points)
+    asked = reflector.asked(hands)
 
     def sample_paths() -> TensorDict:
         rows = _drawn(tasks, plan.batch_size).to(device)
@@ -129,6 +130,7 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
                 "path": torch.cat([told + _PATH_NOISE * torch.randn_like(told), apart], -1),
                 "words": words[rows],
                 "label": label[rows],
+                "asked": asked[rows],
                 "weight": weight[rows],
             },
             batch_size=[len(rows)],

@@ -14,7 +14,7 @@ from worldenv_trl.kinematics.densities import log_density
 from worldenv_trl.kinematics.planes import plane
 from worldenv_trl.reflectors.goal import Goal
 
-__all__ = ["KINDS", "Places", "offsets", "places_of"]
+__all__ = ["KINDS", "Places", "landings", "offsets", "places_of"]
 
 KINDS = 2  # where the hand comes down, where it is when the goal is reached
 _WAVELENGTHS = (0.24, 0.12, 0.06)  # m
@@ -111,21 +111,26 @@ class Places(nn.Module):
 
 
 def places_of(hands: Tensor, reached: Tensor) -> Tensor:
-    """Where each hand comes down and where it is when the goal is reached, [R, K, 3].
-
-    It has come down where it first stops to fall, 3 cm or more below where it began.
+    """Where each hand comes down, on the way to the goal if it is reached, and where it is when it is, [R, K, 3].
 
     Args:
         hands: [R, L, 3] (m), at each look.
         reached: bool [R, L], whether the goal is reached by then.
     """
-    height, rows = hands[..., 2], torch.arange(len(hands), device=hands.device)
+    rows = torch.arange(len(hands), device=hands.device)
     end = torch.where(reached.any(1), reached.long().argmax(1), reached.shape[1] - 1)
+    return torch.stack([hands[rows, torch.minimum(landings(hands), end)], hands[rows, end]], 1)
+
+
+def landings(hands: Tensor) -> Tensor:
+    """The look at which each hand of [R, L, 3] (m) comes down, int64 [R]; L if it does not.
+
+    It has come down where it first stops to fall, 3 cm or more below where it began: a look later that is known.
+    """
+    height = hands[..., 2]
     fall = height - torch.cat([height[:, 1:], height[:, -1:]], 1)
-    until = torch.arange(reached.shape[1], device=hands.device) <= end.unsqueeze(-1)
-    down = (height[:, :1] - height > _FALLEN) & (fall < _STOPPED) & until
-    landed = torch.where(down.any(1), down.long().argmax(1), end)
-    return torch.stack([hands[rows, landed], hands[rows, end]], 1)
+    down = (height[:, :1] - height > _FALLEN) & (fall < _STOPPED)
+    return torch.where(down.any(1), down.long().argmax(1), hands.shape[1])
 
 
 def offsets(hands: Tensor, points: Tensor) -> Tensor:

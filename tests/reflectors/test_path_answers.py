@@ -1,0 +1,128 @@
+"""A path reflector does not take how a hand answers for what it did: where it cannot answer, R is as right."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from test_path import FRONT, SIZE, TEXTS, begun, further, make, paths, scenes
+from videos import Videos, work_through
+
+from worldenv_trl.data import score_episodes
+from worldenv_trl.reflectors import PathLessons
+
+DOWN, STEPS = 5, 14  # frame at which hands have come down, and of an episode
+
+
+def grasps(count, seed, *, answers):
+    """Hands that come down on a block or beside it. Those that miss go back up if they can answer to it, and on as the
+    others do if not."""
+    generator = torch.Generator().manual_seed(seed)
+    block = torch.cat([0.16 * torch.rand(count, 2, generator=generator) - 0.08, torch.full((count, 1), 0.05)], -1)
+    hand = block + torch.cat([0.12 * torch.rand(count, 2, generator=generator) - 0.06, torch.zeros(count, 1)], -1)
+    pixels = [torch.from_numpy(FRONT.project(each.numpy(), SIZE)) for each in (block, hand)]
+    took = (pixels[0] - pixels[1]).norm(dim=-1) < 2.0
+    frame = torch.arange(STEPS + 1)
+    way = hand.unsqueeze(1).repeat(1, STEPS + 1, 1)
+    way[..., 2] += 0.03 * (DOWN - frame).clamp(min=0)
+    after = (frame - DOWN - 3).clamp(min=0)
+    on = torch.stack([0.02 * after, torch.zeros(STEPS + 1), 0.01 * after], -1)
+    back = torch.stack([-0.02 * after, torch.zeros(STEPS + 1), 0.03 * after], -1)
+    way += torch.where((took | (not answers))[:, None, None], on, back)
+    frames = torch.randint(0, 30, (count, STEPS + 1, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
+    grid = torch.arange(SIZE) + 0.5
+    near = [(grid - pixels[0][:, place : place + 1]).abs() < 2 for place in (0, 1)]
+    frames[:, 0] = torch.where((near[0][:, None, :] & near[1][:, :, None]).unsqueeze(1), 250, frames[:, 0])
+    reached = took.unsqueeze(1) & (frame >= STEPS - 2)
+    episodes = Videos({"front": frames}, [TEXTS[0]] * count, reached, [0] * count)
+    states = torch.zeros(count, STEPS + 1, 20)
+    states[..., 7:10], states[..., 10:19] = way, torch.eye(3).flatten()
+    episodes["kinematic_states"] = states
+    return episodes
+
+
+def surprise(reflector, episodes):
+    """Cross-entropy of how episodes end and R at the end, nats."""
+    chance, success = score_episodes(reflector, episodes)[:, -1], episodes["success"].any(1)
+    assert 0.2 < success.float().mean() < 0.8
+    return torch.nn.functional.binary_cross_entropy(chance, success.float()).item()
+
+
+def test_it_knows_in_a_dream_what_it_learned_where_hands_answer():
+    found = {}
+    for blind in (0, 2):
+        lessons = PathLessons(steps=150, place_steps=60, batch_size=32)
+        reflector = make(lessons=lessons, members=1, stride=1, window=0.4, crop_size=13, blind_frames=blind)
+        for lesson in reflector.train().train_on(grasps(256, 0, answers=True)):
+            work_through(reflector)(lesson)
+        for answers in (True, False):
+            found[blind, answers] = surprise(reflector.eval(), grasps(200, 1, answers=answers))
+    assert found[0, True] < 0.2 and found[2, True] < 0.4
+    assert found[2, False] < min(0.4, 0.6 * found[0, False]), found
+
+
+@pytest.mark.parametrize(("stride", "blind"), [(1, 2), (2, 3), (3, 4), (1, 0)])
+def test_the_score_is_the_promise_from_before_the_answer_times_when(stride, blind):
+    reflector, states, first = make(stride=stride, blind_frames=blind), paths(4, 15), scenes(4)
+    heights = [[0.2] * 16, [0.2, 0.15, 0.1, 0.05] + [0.05] * 12, [0.2] * 9 + [0.1] * 7, [0.2] * 13 + [0.1] * 3]
+    states[..., 9] = torch.tensor(heights)
+    looks = -(-blind // stride)
+    asked = []  # by hand: the first look 3 cm below the beginning from which the next falls by less than 1 cm
+    for height in heights:
+        seen = height[::stride]
+        down = [k for k in range(len(seen) - 1) if seen[0] - seen[k] > 0.03 and seen[k] - seen[k + 1] < 0.01]
+        asked.append(down[0] + looks if down else 99)
+    texts = [TEXTS[0]] * 4
+    state = begun(reflector, first, states, texts)
+    streamed = [state["score"].unsqueeze(1)]
+    for start, stop in ((1, 6), (6, 7), (7, 16)):
+        state, scores = further(reflector, state, states, start, stop)
+        streamed.append(scores)
+    view, words, levels = reflector.views_of(texts), reflector.vocabulary.ids(texts), reflector.places.levels(texts)
+    poses = states[:, ::stride, 7:20]
+    crops = reflector.crops(first["front"].unsqueeze(1), view, poses)
+    _, places = reflector.places(first["front"].unsqueeze(1), view, words, levels)
+    chances = reflector.logits(reflector.look(crops), reflector.path(poses, places), words).sigmoid().mean(2)
+    assert chances.shape[-1] == (2 if blind else 1)
+    for row in range(4):
+        for frame, score in enumerate(torch.cat(streamed, 1)[row].tolist()):
+            look = frame // stride
+            promised = chances[row, min(look, asked[row]), 1].item() if blind else 1.0
+            assert score == pytest.approx(chances[row, look, 0].item() * promised, abs=1e-5)
+
+
+def test_when_is_learned_from_episodes_that_succeed_and_whether_from_all():
+    reflector, episodes = make(lessons=PathLessons(steps=1, batch_size=8), blind_frames=2), grasps(8, 0, answers=True)
+    for lesson in reflector.train_on(episodes):
+        batch = lesson.sample()
+    succeeds = batch["label"].any(1)
+    assert 0 < succeeds.sum() < len(succeeds)
+
+    def learned(rows):
+        reflector.zero_grad()
+        reflector.training_loss(batch[rows])["loss_reflector"].backward()
+        return [
+            [each.head[-1].weight.grad[answer].abs().max().item() for answer in (0, 1)] for each in reflector.members
+        ]
+
+    assert all(when > 0 and whether > 0 for when, whether in learned(succeeds))
+    assert all(when == 0 and whether > 0 for when, whether in learned(~succeeds))
+    before = reflector.training_loss(batch)["loss_reflector"]
+    later = batch["path"].clone()
+    later[~succeeds, int(batch["asked"].max()) + 1 :] += 1
+    batch["path"] = later
+    torch.testing.assert_close(reflector.training_loss(batch)["loss_reflector"], before)  # nor is it read
+
+
+def test_it_is_asked_once_whatever_comes_later():
+    reflector = make(stride=2, blind_frames=3)
+    hands = torch.zeros(3, 8, 3)
+    hands[0, :, 2] = torch.tensor([0.3, 0.2, 0.1, 0.1, 0.3, 0.3, 0.1, 0.1])
+    hands[1, :, 2] = 0.3
+    hands[2, :, 2] = torch.linspace(0.3, 0.0, 8)
+    asked = reflector.asked(hands)
+    assert asked[0] == 2 + 2 and (asked[1:] >= 8).all()
+
+
+def test_time_does_not_run_backwards():
+    with pytest.raises(ValueError, match="blind_frames must be at least 0, got -1"):
+        make(blind_frames=-1)
