@@ -121,8 +121,8 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             f"explore.replay_share {config.explore.replay_share} of {config.explore.episodes_per_task} episodes a task "
             "leaves none of the policy's own to be played again: lower it"
         )
-    if config.reflector.blind and not config.reflector.path_steps:
-        raise ValueError("reflector.blind is of the reflector that judges by the path: set reflector.path_steps, got 0")
+    if config.reflector.open_loop and not config.reflector.path_steps:
+        raise ValueError("reflector.open_loop is of the reflector that judges paths: set reflector.path_steps, got 0")
     try:
         StopRule(config.reflector.threshold, config.reflector.consecutive)
     except ValueError as error:

@@ -138,9 +138,10 @@ class Reflector:
     0. Half as many come before, in which it finds the places that matter there. The first one then judges real frames
     alone, and no imagined episodes are made for it. A batch is shared by the tasks: ten want three times what three
     do."""
-    blind: bool = False
-    """It is not told how a hand goes on once that can see what it has done (``PathReflector``'s ``blind_frames``, a
-    chunk): in the world that betrays how a rollout ends, in imagination it says nothing."""
+    open_loop: bool = False
+    """The one that judges in imagination says how a rollout will end from no more than its path up to a chunk after the
+    hand has come down (``PathReflector``'s ``open_loop_frames``). How a hand goes on once it can see what it has done
+    betrays that in the world; in imagination it says nothing."""
     holdout: float = 0.2
     """Share of the exploration's initial states kept out, for the figures and for the choice of the stopping rule."""
     threshold: float = 0.5

@@ -24,7 +24,7 @@ WHOLE = dataclasses.replace(
     SMALL,
     max_steps=40,
     explore=config.Explore(episodes_per_task=8, num_envs=4, scale_factors=(0.0, 1.0), replay_share=0.25),
-    reflector=dataclasses.replace(SMALL.reflector, path_steps=2, blind=True),
+    reflector=dataclasses.replace(SMALL.reflector, path_steps=2, open_loop=True),
     adapt=config.Adapt(steps=2, episodes_per_task=2, batch_size=2),
     post_train=dataclasses.replace(SMALL.post_train, iterations=2, hold=1.0),
 )

@@ -53,8 +53,8 @@ def test_what_a_loader_knows_is_not_guessed(tiny):
     open_run(tiny, dataclasses.replace(COMPACT, policy=swapped)).close()
 
 
-@pytest.mark.parametrize("blind", [False, True])
-def test_a_blind_judge_is_told_no_more_than_a_chunk_of_how_a_hand_goes_on(tiny, blind):
-    told = dataclasses.replace(tiny.reflector, path_steps=1, blind=blind)
+@pytest.mark.parametrize("open_loop", [False, True])
+def test_what_a_hand_does_open_loop_is_a_chunk(tiny, open_loop):
+    told = dataclasses.replace(tiny.reflector, path_steps=1, open_loop=open_loop)
     reflector = COMPACT.reflector.make(dataclasses.replace(tiny, reflector=told))
-    assert reflector.path.config.blind_frames == (tiny.chunk_length if blind else 0)
+    assert reflector.path.config.open_loop_frames == (tiny.chunk_length if open_loop else 0)

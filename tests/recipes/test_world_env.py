@@ -50,8 +50,8 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"world_model": WorldModel(failure_share=1.5)}, "world_model.failure_share must lie between 0 and 1, got 1.5"),
         ({"reflector": Reflector(path_steps=-1)}, "reflector.path_steps must be at least 0, got -1"),
         (
-            {"reflector": Reflector(blind=True)},
-            "reflector.blind is of the reflector that judges by the path: .*, got 0",
+            {"reflector": Reflector(open_loop=True)},
+            "reflector.open_loop is of the reflector that judges paths: .*, got 0",
         ),
         (
             {"reflector": Reflector(path_steps=1), "cameras": ("wrist",)},

@@ -124,6 +124,15 @@ def test_what_comes_later_changes_no_earlier_score():
     assert (one[:, 8:] != two[:, 8:]).all()
 
 
+def showing(pixel, steps, generator):
+    """Dark frames [n, steps + 1, 3, H, W] of which the first alone shows a block at ``pixel`` [n, 2]."""
+    frames = torch.randint(0, 30, (len(pixel), steps + 1, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
+    grid = torch.arange(SIZE) + 0.5
+    near = ((grid - pixel[:, :1]).abs() < 2)[:, None, :] & ((grid - pixel[:, 1:]).abs() < 2)[:, :, None]
+    frames[:, 0] = torch.where(near.unsqueeze(1), 250, frames[:, 0])
+    return frames
+
+
 def touching(count, seed, texts=TEXTS):
     """Labelled episodes: a block somewhere on the table; the goal is reached where the hand is seen to pass near it."""
     generator = torch.Generator().manual_seed(seed)
@@ -131,11 +140,8 @@ def touching(count, seed, texts=TEXTS):
     share = torch.rand(count, 1, generator=generator)
     block = torch.lerp(states[:, 0, 7:10], states[:, -1, 7:10], share)  # somewhere under the way, or beside it
     block = block + 0.24 * (torch.rand(count, 3, generator=generator) - 0.5)
-    frames = torch.randint(0, 30, (count, steps + 1, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
     pixel = torch.from_numpy(FRONT.project(block.numpy(), SIZE))
-    grid = torch.arange(SIZE) + 0.5
-    near = ((grid - pixel[:, :1]).abs() < 2)[:, None, :] & ((grid - pixel[:, 1:]).abs() < 2)[:, :, None]
-    frames[:, 0] = torch.where(near.unsqueeze(1), 250, frames[:, 0])  # shown by the first frame alone
+    frames = showing(pixel, steps, generator)
     task = [row % len(texts) for row in range(count)]
     close = torch.from_numpy(FRONT.project(states[..., 7:10].numpy(), SIZE))  # as the camera sees it
     reached = ((close - pixel.unsqueeze(1)).norm(dim=-1) < 2.5).long().cummax(1).values > 0

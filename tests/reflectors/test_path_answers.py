@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_path import FRONT, SIZE, TEXTS, begun, further, make, paths, scenes
+from test_path import FRONT, SIZE, TEXTS, begun, further, make, paths, scenes, showing
 from videos import Videos, work_through
 
 from worldenv_trl.data import score_episodes
@@ -28,12 +28,8 @@ def grasps(count, seed, *, answers):
     on = torch.stack([0.02 * after, torch.zeros(STEPS + 1), 0.01 * after], -1)
     back = torch.stack([-0.02 * after, torch.zeros(STEPS + 1), 0.03 * after], -1)
     way += torch.where((took | (not answers))[:, None, None], on, back)
-    frames = torch.randint(0, 30, (count, STEPS + 1, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
-    grid = torch.arange(SIZE) + 0.5
-    near = [(grid - pixels[0][:, place : place + 1]).abs() < 2 for place in (0, 1)]
-    frames[:, 0] = torch.where((near[0][:, None, :] & near[1][:, :, None]).unsqueeze(1), 250, frames[:, 0])
     reached = took.unsqueeze(1) & (frame >= STEPS - 2)
-    episodes = Videos({"front": frames}, [TEXTS[0]] * count, reached, [0] * count)
+    episodes = Videos({"front": showing(pixels[0], STEPS, generator)}, [TEXTS[0]] * count, reached, [0] * count)
     states = torch.zeros(count, STEPS + 1, 20)
     states[..., 7:10], states[..., 10:19] = way, torch.eye(3).flatten()
     episodes["kinematic_states"] = states
@@ -49,23 +45,23 @@ def surprise(reflector, episodes):
 
 def test_it_knows_in_a_dream_what_it_learned_where_hands_answer():
     found = {}
-    for blind in (0, 2):
+    for frames in (0, 2):
         lessons = PathLessons(steps=150, place_steps=60, batch_size=32)
-        reflector = make(lessons=lessons, members=1, stride=1, window=0.4, crop_size=13, blind_frames=blind)
+        reflector = make(lessons=lessons, members=1, stride=1, window=0.4, crop_size=13, open_loop_frames=frames)
         for lesson in reflector.train().train_on(grasps(256, 0, answers=True)):
             work_through(reflector)(lesson)
         for answers in (True, False):
-            found[blind, answers] = surprise(reflector.eval(), grasps(200, 1, answers=answers))
+            found[frames, answers] = surprise(reflector.eval(), grasps(200, 1, answers=answers))
     assert found[0, True] < 0.2 and found[2, True] < 0.4
     assert found[2, False] < min(0.4, 0.6 * found[0, False]), found
 
 
-@pytest.mark.parametrize(("stride", "blind"), [(1, 2), (2, 3), (3, 4), (1, 0)])
-def test_the_score_is_the_promise_from_before_the_answer_times_when(stride, blind):
-    reflector, states, first = make(stride=stride, blind_frames=blind), paths(4, 15), scenes(4)
+@pytest.mark.parametrize(("stride", "open_loop"), [(1, 2), (2, 3), (3, 4), (1, 0)])
+def test_the_score_is_the_promise_from_before_the_answer_times_when(stride, open_loop):
+    reflector, states, first = make(stride=stride, open_loop_frames=open_loop), paths(4, 15), scenes(4)
     heights = [[0.2] * 16, [0.2, 0.15, 0.1, 0.05] + [0.05] * 12, [0.2] * 9 + [0.1] * 7, [0.2] * 13 + [0.1] * 3]
     states[..., 9] = torch.tensor(heights)
-    looks = -(-blind // stride)
+    looks = -(-open_loop // stride)
     asked = []  # by hand: the first look 3 cm below the beginning from which the next falls by less than 1 cm
     for height in heights:
         seen = height[::stride]
@@ -82,16 +78,19 @@ def test_the_score_is_the_promise_from_before_the_answer_times_when(stride, blin
     crops = reflector.crops(first["front"].unsqueeze(1), view, poses)
     _, places = reflector.places(first["front"].unsqueeze(1), view, words, levels)
     chances = reflector.logits(reflector.look(crops), reflector.path(poses, places), words).sigmoid().mean(2)
-    assert chances.shape[-1] == (2 if blind else 1)
+    assert chances.shape[-1] == (2 if open_loop else 1)
     for row in range(4):
         for frame, score in enumerate(torch.cat(streamed, 1)[row].tolist()):
             look = frame // stride
-            promised = chances[row, min(look, asked[row]), 1].item() if blind else 1.0
+            promised = chances[row, min(look, asked[row]), 1].item() if open_loop else 1.0
             assert score == pytest.approx(chances[row, look, 0].item() * promised, abs=1e-5)
 
 
 def test_when_is_learned_from_episodes_that_succeed_and_whether_from_all():
-    reflector, episodes = make(lessons=PathLessons(steps=1, batch_size=8), blind_frames=2), grasps(8, 0, answers=True)
+    reflector, episodes = (
+        make(lessons=PathLessons(steps=1, batch_size=8), open_loop_frames=2),
+        grasps(8, 0, answers=True),
+    )
     for lesson in reflector.train_on(episodes):
         batch = lesson.sample()
     succeeds = batch["label"].any(1)
@@ -114,7 +113,7 @@ def test_when_is_learned_from_episodes_that_succeed_and_whether_from_all():
 
 
 def test_it_is_asked_once_whatever_comes_later():
-    reflector = make(stride=2, blind_frames=3)
+    reflector = make(stride=2, open_loop_frames=3)
     hands = torch.zeros(3, 8, 3)
     hands[0, :, 2] = torch.tensor([0.3, 0.2, 0.1, 0.1, 0.3, 0.3, 0.1, 0.1])
     hands[1, :, 2] = 0.3
@@ -124,5 +123,5 @@ def test_it_is_asked_once_whatever_comes_later():
 
 
 def test_time_does_not_run_backwards():
-    with pytest.raises(ValueError, match="blind_frames must be at least 0, got -1"):
-        make(blind_frames=-1)
+    with pytest.raises(ValueError, match="open_loop_frames must be at least 0, got -1"):
+        make(open_loop_frames=-1)

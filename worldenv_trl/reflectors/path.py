@@ -43,8 +43,8 @@ class PathReflectorConfig:
         window: side of what is seen around the hand, in shares of the frame's.
         crop_size: pixels (px) that this window is resampled to.
         stride: frames from one look to the next.
-        blind_frames: how long a hand goes on after it has come down before it can answer to what came of that: a
-            policy's chunk. At 0 it may answer at once, and R is read from how it does.
+        open_loop_frames: how many frames a hand goes on open loop after it has come down, before it can answer to
+            what came of that: a policy's chunk. At 0 R is read from how it answers, too.
         feature_dim: length of what is seen at a look.
         width: channels of the convolutions over time.
         dropout: while learning.
@@ -59,7 +59,7 @@ class PathReflectorConfig:
     window: float = 0.28
     crop_size: int = 18
     stride: int = 2
-    blind_frames: int = 0
+    open_loop_frames: int = 0
     feature_dim: int = 32
     width: int = 96
     dropout: float = 0.2
@@ -80,8 +80,8 @@ class PathReflectorConfig:
                 "stride, feature_dim, width and members must be at least 1 and crop_size at least 8, got "
                 f"{self.stride}, {self.feature_dim}, {self.width}, {self.members} and {self.crop_size}"
             )
-        if self.blind_frames < 0:
-            raise ValueError(f"blind_frames must be at least 0, got {self.blind_frames}")
+        if self.open_loop_frames < 0:
+            raise ValueError(f"open_loop_frames must be at least 0, got {self.open_loop_frames}")
         if not 0 < self.window <= 1 or not 0 <= self.dropout < 1:
             raise ValueError(f"window must be in (0, 1] and dropout in [0, 1), got {self.window} and {self.dropout}")
 
@@ -114,9 +114,10 @@ class PathReflector(Reflector, Pretrained):
 
     A hand that sees the world answers to what happens there: it goes back for what it missed, or it goes on. Whoever
     watches real rollouts learns to read that, and reads it where there is nothing to be read: in a dream the hand goes
-    on, whatever it did. With ``blind_frames`` R is the product of two chances: that the goal will be reached, asked of
-    no more of the path than that long after the hand has come down, before it can have answered; and that it is reached
-    by now if it ever is, which is learned from episodes that succeed, and so says when and not whether.
+    on, whatever it did (causal confusion, arXiv:1905.11979). With ``open_loop_frames`` R is the product of two chances:
+    that the goal will be reached, asked of no more of the path than that long after the hand has come down, before it
+    can have answered; and that it is reached by now if it ever is, which is learned from episodes that succeed, and so
+    says when and not whether.
 
     A hand view is what others predict as a second camera (Ctrl-World, 2510.10125); success told for every frame is the
     reward head of World-VLA-Loop (2602.06508).
@@ -219,7 +220,7 @@ class PathReflector(Reflector, Pretrained):
 
     def _judged(self, chances: Tensor, hands: Tensor) -> Tensor:
         """R [n, L] of what is said at each look, [n, L, A], and hands [n, L, 3]."""
-        if not self.config.blind_frames:
+        if not self.config.open_loop_frames:
             return chances[..., 0]
         look = torch.arange(chances.shape[1], device=hands.device)
         promised = chances[..., 1].gather(1, torch.minimum(look, self.asked(hands).unsqueeze(-1)))
@@ -228,7 +229,7 @@ class PathReflector(Reflector, Pretrained):
     def asked(self, hands: Tensor) -> Tensor:
         """The last look, int64 [n], at which hands [n, L, 3] cannot have answered to what they did: L or more where
         that is not among them."""
-        return landings(hands) + -(-self.config.blind_frames // self.config.stride)
+        return landings(hands) + -(-self.config.open_loop_frames // self.config.stride)
 
     def moves(self, poses: Tensor) -> Tensor:
         """Poses [n, L, 13], one at each look, and how they changed, normalised: [n, L, 26]."""
@@ -276,7 +277,7 @@ class PathReflector(Reflector, Pretrained):
         return torch.stack([cast(_Member, member).look(crops) for member in self.members], 2)
 
     def logits(self, looks: Tensor, path: Tensor, words: Tensor) -> Tensor:
-        """Log-odds [P, L, M, A] of every prefix and member: that the goal is reached by then; with ``blind_frames``
+        """Log-odds [P, L, M, A] of every prefix and member: that the goal is reached by then; with ``open_loop_frames``
         that it is if it ever is, and that it will be.
 
         Args:
@@ -304,7 +305,7 @@ class PathReflector(Reflector, Pretrained):
 
     def training_loss(self, batch: TensorDictBase) -> TensorDict:
         """Of paths the binary cross-entropy of "reached by then", mean over episodes of the mean over looks plus that
-        of the last; with ``blind_frames`` that of episodes which succeed, 0 for the others, and that of "will be
+        of the last; with ``open_loop_frames`` that of episodes which succeed, 0 for the others, and that of "will be
         reached" at the look where it is asked. Of places the divergence of the maps from what they are taught.
 
         Args:
@@ -324,7 +325,7 @@ class PathReflector(Reflector, Pretrained):
         rows = torch.arange(len(last), device=last.device)
         told = (each * weight.unsqueeze(-1)).sum(1) / weight.sum(1, keepdim=True) + each[rows, last]
         decides, outcome = logits[rows, last], label[rows, last].unsqueeze(-1)
-        if self.config.blind_frames:
+        if self.config.open_loop_frames:
             decides = answers[rows, torch.minimum(batch["asked"], last), :, 1]
             promised = F.binary_cross_entropy_with_logits(decides, outcome.expand_as(decides), reduction="none")
             told = outcome * told + promised
@@ -356,7 +357,7 @@ class _Member(nn.Module):
         apart = offsets(torch.zeros(1, 1, 3), torch.zeros(1, KINDS * len(config.cameras), 2)).shape[-1]
         self.into = nn.Linear(config.feature_dim + 2 * POSE_DIM + apart, width)
         self.over_time = nn.ModuleList(_Causal(width, dilation, config.dropout) for dilation in _DILATIONS)
-        self.head = nn.Sequential(nn.Dropout(config.dropout), nn.Linear(3 * width, 1 + (config.blind_frames > 0)))
+        self.head = nn.Sequential(nn.Dropout(config.dropout), nn.Linear(3 * width, 1 + (config.open_loop_frames > 0)))
 
     def look(self, crops: Tensor) -> Tensor:
         """Features [P, L, F] of crops [P, L, 3 V, S, S]."""
