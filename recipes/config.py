@@ -139,9 +139,9 @@ class Reflector:
     alone, and no imagined episodes are made for it. A batch is shared by the tasks: ten want three times what three
     do."""
     open_loop: bool = False
-    """The one that judges in imagination says how a rollout will end from no more than its path up to a chunk after the
+    """Half of what the one that judges in imagination says is read from no more than the path up to a chunk after the
     hand has come down (``PathReflector``'s ``open_loop_frames``). How a hand goes on once it can see what it has done
-    betrays that in the world; in imagination it says nothing."""
+    betrays in the world how its rollout will end; in imagination it says nothing."""
     holdout: float = 0.2
     """Share of the exploration's initial states kept out, for the figures and for the choice of the stopping rule."""
     threshold: float = 0.5

@@ -57,7 +57,7 @@ def test_it_knows_in_a_dream_what_it_learned_where_hands_answer():
 
 
 @pytest.mark.parametrize(("stride", "open_loop"), [(1, 2), (2, 3), (3, 4), (1, 0)])
-def test_the_score_is_the_promise_from_before_the_answer_times_when(stride, open_loop):
+def test_the_score_is_the_mean_of_the_whole_path_and_of_promise_times_when(stride, open_loop):
     reflector, states, first = make(stride=stride, open_loop_frames=open_loop), paths(4, 15), scenes(4)
     heights = [[0.2] * 16, [0.2, 0.15, 0.1, 0.05] + [0.05] * 12, [0.2] * 9 + [0.1] * 7, [0.2] * 13 + [0.1] * 3]
     states[..., 9] = torch.tensor(heights)
@@ -78,15 +78,18 @@ def test_the_score_is_the_promise_from_before_the_answer_times_when(stride, open
     crops = reflector.crops(first["front"].unsqueeze(1), view, poses)
     _, places = reflector.places(first["front"].unsqueeze(1), view, words, levels)
     chances = reflector.logits(reflector.look(crops), reflector.path(poses, places), words).sigmoid().mean(2)
-    assert chances.shape[-1] == (2 if open_loop else 1)
+    assert chances.shape[-1] == (3 if open_loop else 1)
     for row in range(4):
         for frame, score in enumerate(torch.cat(streamed, 1)[row].tolist()):
             look = frame // stride
-            promised = chances[row, min(look, asked[row]), 1].item() if open_loop else 1.0
-            assert score == pytest.approx(chances[row, look, 0].item() * promised, abs=1e-5)
+            expected = whole = chances[row, look, 0].item()
+            if open_loop:
+                when, promised = chances[row, look, 1].item(), chances[row, min(look, asked[row]), 2].item()
+                expected = (whole + when * promised) / 2
+            assert score == pytest.approx(expected, abs=1e-5)
 
 
-def test_when_is_learned_from_episodes_that_succeed_and_whether_from_all():
+def test_when_is_learned_from_episodes_that_succeed_and_the_others_from_all():
     reflector, episodes = (
         make(lessons=PathLessons(steps=1, batch_size=8), open_loop_frames=2),
         grasps(8, 0, answers=True),
@@ -100,16 +103,27 @@ def test_when_is_learned_from_episodes_that_succeed_and_whether_from_all():
         reflector.zero_grad()
         reflector.training_loss(batch[rows])["loss_reflector"].backward()
         return [
-            [each.head[-1].weight.grad[answer].abs().max().item() for answer in (0, 1)] for each in reflector.members
+            [each.head[-1].weight.grad[answer].abs().max().item() for answer in (0, 1, 2)] for each in reflector.members
         ]
 
-    assert all(when > 0 and whether > 0 for when, whether in learned(succeeds))
-    assert all(when == 0 and whether > 0 for when, whether in learned(~succeeds))
-    before = reflector.training_loss(batch)["loss_reflector"]
-    later = batch["path"].clone()
-    later[~succeeds, int(batch["asked"].max()) + 1 :] += 1
-    batch["path"] = later
-    torch.testing.assert_close(reflector.training_loss(batch)["loss_reflector"], before)  # nor is it read
+    assert all(min(each) > 0 for each in learned(succeeds))
+    assert all(whole > 0 and when == 0 and promise > 0 for whole, when, promise in learned(~succeeds))
+
+
+def test_the_promise_does_not_read_what_comes_after_it_is_asked():
+    reflector = make(lessons=PathLessons(steps=1, batch_size=8), open_loop_frames=2)
+    for lesson in reflector.train_on(grasps(8, 0, answers=True)):
+        batch = lesson.sample()
+    later = batch.clone()
+    later["path"][:, int(batch["asked"].max()) + 1 :] += 1
+    gradients = []
+    for each in (batch, later):
+        reflector.zero_grad()
+        reflector.training_loss(each)["loss_reflector"].backward()
+        gradients.append([member.head[-1].weight.grad.clone() for member in reflector.members])
+    for before, after in zip(*gradients, strict=True):
+        torch.testing.assert_close(after[2], before[2])
+        assert not torch.allclose(after[0], before[0])
 
 
 def test_it_is_asked_once_whatever_comes_later():

@@ -44,7 +44,7 @@ class PathReflectorConfig:
         crop_size: pixels (px) that this window is resampled to.
         stride: frames from one look to the next.
         open_loop_frames: how many frames a hand goes on open loop after it has come down, before it can answer to
-            what came of that: a policy's chunk. At 0 R is read from how it answers, too.
+            what came of that: a policy's chunk. At 0 R is read from the whole path alone, how it answers included.
         feature_dim: length of what is seen at a look.
         width: channels of the convolutions over time.
         dropout: while learning.
@@ -114,10 +114,11 @@ class PathReflector(Reflector, Pretrained):
 
     A hand that sees the world answers to what happens there: it goes back for what it missed, or it goes on. Whoever
     watches real rollouts learns to read that, and reads it where there is nothing to be read: in a dream the hand goes
-    on, whatever it did (causal confusion, arXiv:1905.11979). With ``open_loop_frames`` R is the product of two chances:
-    that the goal will be reached, asked of no more of the path than that long after the hand has come down, before it
-    can have answered; and that it is reached by now if it ever is, which is learned from episodes that succeed, and so
-    says when and not whether.
+    on, whatever it did (causal confusion, arXiv:1905.11979). With ``open_loop_frames`` R is the mean of two judgements.
+    One reads the whole path. The other is the product of two chances: that the goal will be reached, asked of no more
+    of the path than that long after the hand has come down, before it can have answered; and that it is reached by now
+    if it ever is, which is learned from episodes that succeed, and so says when and not whether. The first is misled
+    where hands answer, the second does not see what is decided later, such as where a thing is put down.
 
     A hand view is what others predict as a second camera (Ctrl-World, 2510.10125); success told for every frame is the
     reward head of World-VLA-Loop (2602.06508).
@@ -223,8 +224,9 @@ class PathReflector(Reflector, Pretrained):
         if not self.config.open_loop_frames:
             return chances[..., 0]
         look = torch.arange(chances.shape[1], device=hands.device)
-        promised = chances[..., 1].gather(1, torch.minimum(look, self.asked(hands).unsqueeze(-1)))
-        return chances[..., 0] * promised
+        whole, when, promise = chances.unbind(-1)
+        promised = promise.gather(1, torch.minimum(look, self.asked(hands).unsqueeze(-1)))
+        return (whole + when * promised) / 2
 
     def asked(self, hands: Tensor) -> Tensor:
         """The last look, int64 [n], at which hands [n, L, 3] cannot have answered to what they did: L or more where
@@ -278,7 +280,7 @@ class PathReflector(Reflector, Pretrained):
 
     def logits(self, looks: Tensor, path: Tensor, words: Tensor) -> Tensor:
         """Log-odds [P, L, M, A] of every prefix and member: that the goal is reached by then; with ``open_loop_frames``
-        that it is if it ever is, and that it will be.
+        also that it is if it ever is, and that it will be.
 
         Args:
             looks: [P, L, M, F], what the members saw at each look.
@@ -305,8 +307,9 @@ class PathReflector(Reflector, Pretrained):
 
     def training_loss(self, batch: TensorDictBase) -> TensorDict:
         """Of paths the binary cross-entropy of "reached by then", mean over episodes of the mean over looks plus that
-        of the last; with ``open_loop_frames`` that of episodes which succeed, 0 for the others, and that of "will be
-        reached" at the look where it is asked. Of places the divergence of the maps from what they are taught.
+        of the last; with ``open_loop_frames`` the same of "reached by then if ever", 0 for episodes that do not
+        succeed, and that of "will be reached" at the look where it is asked. Of places the divergence of the maps from
+        what they are taught.
 
         Args:
             batch: [P] of one lesson. Of ``paths``: ``crops`` floats [P, L, 3 V, S, S], ``path`` [P, L, 26 + F],
@@ -319,16 +322,14 @@ class PathReflector(Reflector, Pretrained):
         label, weight = batch["label"].float(), batch["weight"]
         looks = self.look(batch["crops"])
         answers = self.logits(looks, batch["path"], batch["words"])
-        logits = answers[..., 0]
-        each = F.binary_cross_entropy_with_logits(logits, label.unsqueeze(-1).expand_as(logits), reduction="none")
         last = (weight.sum(1).long() - 1).clamp(min=0)
         rows = torch.arange(len(last), device=last.device)
-        told = (each * weight.unsqueeze(-1)).sum(1) / weight.sum(1, keepdim=True) + each[rows, last]
-        decides, outcome = logits[rows, last], label[rows, last].unsqueeze(-1)
+        decides, outcome = answers[rows, last, :, 0], label[rows, last].unsqueeze(-1)
+        told = _cross_entropy(answers[..., 0], label, weight, last)
         if self.config.open_loop_frames:
-            decides = answers[rows, torch.minimum(batch["asked"], last), :, 1]
-            promised = F.binary_cross_entropy_with_logits(decides, outcome.expand_as(decides), reduction="none")
-            told = outcome * told + promised
+            promise = answers[rows, torch.minimum(batch["asked"], last), :, 2]
+            promised = F.binary_cross_entropy_with_logits(promise, outcome.expand_as(promise), reduction="none")
+            told = told + outcome * _cross_entropy(answers[..., 1], label, weight, last) + promised
         loss = told.mean(0).sum()  # members learn on their own
         right = (decides.detach().sigmoid().mean(-1) > 0.5) == (outcome.squeeze(-1) > 0.5)
         return TensorDict({"loss_reflector": loss, "accuracy": right.float().mean()})
@@ -339,6 +340,13 @@ class PathReflector(Reflector, Pretrained):
         loss = self.places.divergence(maps, self.pixels(place, view)).mean(0).sum()
         away = (points.detach().unflatten(1, (-1, KINDS)) - place[:, None, :, :2]).norm(dim=-1)
         return TensorDict({"loss_reflector": loss, "accuracy": (away < 0.02).float().mean()})
+
+
+def _cross_entropy(logits: Tensor, label: Tensor, weight: Tensor, last: Tensor) -> Tensor:
+    """Of logits [P, L, M] and label and weight [P, L]: the mean over looks plus that of the last, [P, M]."""
+    each = F.binary_cross_entropy_with_logits(logits, label.unsqueeze(-1).expand_as(logits), reduction="none")
+    whole = (each * weight.unsqueeze(-1)).sum(1) / weight.sum(1, keepdim=True)
+    return whole + each[torch.arange(len(last), device=last.device), last]
 
 
 class _Member(nn.Module):
@@ -357,7 +365,7 @@ class _Member(nn.Module):
         apart = offsets(torch.zeros(1, 1, 3), torch.zeros(1, KINDS * len(config.cameras), 2)).shape[-1]
         self.into = nn.Linear(config.feature_dim + 2 * POSE_DIM + apart, width)
         self.over_time = nn.ModuleList(_Causal(width, dilation, config.dropout) for dilation in _DILATIONS)
-        self.head = nn.Sequential(nn.Dropout(config.dropout), nn.Linear(3 * width, 1 + (config.open_loop_frames > 0)))
+        self.head = nn.Sequential(nn.Dropout(config.dropout), nn.Linear(3 * width, 3 if config.open_loop_frames else 1))
 
     def look(self, crops: Tensor) -> Tensor:
         """Features [P, L, F] of crops [P, L, 3 V, S, S]."""
