@@ -89,41 +89,40 @@ def test_the_score_is_the_mean_of_the_whole_path_and_of_promise_times_when(strid
             assert score == pytest.approx(expected, abs=1e-5)
 
 
-def test_when_is_learned_from_episodes_that_succeed_and_the_others_from_all():
-    reflector, episodes = (
-        make(lessons=PathLessons(steps=1, batch_size=8), open_loop_frames=2),
-        grasps(8, 0, answers=True),
-    )
-    for lesson in reflector.train_on(episodes):
-        batch = lesson.sample()
-    succeeds = batch["label"].any(1)
-    assert 0 < succeeds.sum() < len(succeeds)
-
-    def learned(rows):
-        reflector.zero_grad()
-        reflector.training_loss(batch[rows])["loss_reflector"].backward()
-        return [
-            [each.head[-1].weight.grad[answer].abs().max().item() for answer in (0, 1, 2)] for each in reflector.members
-        ]
-
-    assert all(min(each) > 0 for each in learned(succeeds))
-    assert all(whole > 0 and when == 0 and promise > 0 for whole, when, promise in learned(~succeeds))
-
-
-def test_the_promise_does_not_read_what_comes_after_it_is_asked():
+def learning():
+    """A reflector that asks open loop, and paths of hands that answer."""
     reflector = make(lessons=PathLessons(steps=1, batch_size=8), open_loop_frames=2)
     for lesson in reflector.train_on(grasps(8, 0, answers=True)):
         batch = lesson.sample()
-    later = batch.clone()
-    later["path"][:, int(batch["asked"].max()) + 1 :] += 1
-    gradients = []
-    for each in (batch, later):
-        reflector.zero_grad()
-        reflector.training_loss(each)["loss_reflector"].backward()
-        gradients.append([member.head[-1].weight.grad.clone() for member in reflector.members])
-    for before, after in zip(*gradients, strict=True):
+    succeeds = batch["label"].any(1)
+    assert 0 < succeeds.sum() < len(succeeds)
+    return reflector, batch, succeeds
+
+
+def slopes(reflector, batch):
+    """Of each member's last layer: one row of each answer, whole path, when and promise."""
+    reflector.zero_grad()
+    reflector.training_loss(batch)["loss_reflector"].backward()
+    return [member.head[-1].weight.grad.clone() for member in reflector.members]
+
+
+def test_when_is_learned_from_episodes_that_succeed_and_the_others_from_all():
+    reflector, batch, succeeds = learning()
+    for slope in slopes(reflector, batch[succeeds]):
+        assert slope.abs().amax(1).min() > 0
+    for whole, when, promise in slopes(reflector, batch[~succeeds]):
+        assert whole.any() and promise.any() and not when.any()
+
+
+@pytest.mark.parametrize("of_all", [True, False])
+def test_the_promise_does_not_read_what_comes_later_and_when_not_what_failures_do(of_all):
+    reflector, batch, succeeds = learning()
+    later, moved = batch.clone(), torch.ones_like(succeeds) if of_all else ~succeeds
+    later["path"][moved, int(batch["asked"].max()) + 1 :] += 1
+    for before, after in zip(slopes(reflector, batch), slopes(reflector, later), strict=True):
         torch.testing.assert_close(after[2], before[2])
         assert not torch.allclose(after[0], before[0])
+        assert torch.allclose(after[1], before[1]) != of_all
 
 
 def test_it_is_asked_once_whatever_comes_later():
