@@ -106,6 +106,8 @@ def test_steps_and_keys_are_chosen(tmp_path, monkeypatch):
     write(tmp_path / "a.mcap", rollouts)
     read = read_rollouts(tmp_path / "a.mcap", steps=slice(2, 5))
     assert_same(read, rollouts[:, 2:5])
+    with pytest.raises(ValueError, match=r"steps=slice\(6, 9, None\) chooses none: .* has 6 steps"):
+        read_rollouts(tmp_path / "a.mcap", steps=slice(6, 9))
     monkeypatch.setattr(part, "_fill", lambda *_: pytest.fail("a frame was decoded"))
     read = read_rollouts(tmp_path / "a.mcap", keys=[keys.ACTION, ("next", "reward")])
     assert set(read.keys(True, True)) == {keys.ACTION, ("next", "reward"), keys.MASK}

@@ -67,7 +67,8 @@ def read_rollouts(
         FileNotFoundError: if there is no such file, or none in the folder.
         TypeError: if an argument is of another kind.
         ValueError: for a file that is no MCAP, without messages that it should hold, or not written by this package
-            or by a later release of it; for files whose entries differ; if ``task``, a rollout or a key is not in them.
+            or by a later release of it; for files whose entries differ; if ``task``, a rollout, a key or any of the
+            ``steps`` is not in them.
     """
     if rollouts is not None and hasattr(rollouts, "tolist"):  # arrays and tensors
         rollouts = rollouts.tolist()
@@ -90,8 +91,17 @@ def read_rollouts(
         raise ValueError(f"{path} holds no rollouts{asked}{': ' + lost[0] if lost else ''}")
     out = _join(parts, path)
     if steps is not None:
-        out = out[..., steps]
+        out = _part_of(out, steps, path)
     return out if keys is None else _selected(out, keys, recordings, path)
+
+
+def _part_of(rollouts: TensorDict, steps: slice, path: str | os.PathLike) -> TensorDict:
+    part = rollouts[..., steps]
+    if not part.shape[-1]:
+        raise ValueError(
+            f"steps={steps} chooses none: the longest rollout asked for of {path} has {rollouts.shape[-1]} steps"
+        )
+    return part
 
 
 def list_rollouts(path: str | os.PathLike, *, replays: bool = False) -> list[RolloutInfo]:
