@@ -245,7 +245,13 @@ def test_the_reflector_stops_where_it_did_and_another_threshold_stops_elsewhere(
     class Hasty(Redness):
         factor = 1.3
 
-    hasty = replay(tmp_path / "a.mcap", 0, world_model=model, reflector=Hasty(), write=False)
+    hasty = replay(tmp_path / "a.mcap", 0, world_model=model, reflector=Hasty())
+    played, before = read_rollouts(hasty.target)[0], read_rollouts(tmp_path / "a.mcap", rollouts=0)[0]
+    for name in ("success_prob", "state"):  # what was recorded lies beside it, decision by decision
+        key = keys.STATE if name == "state" else (name,)
+        # The replay ends inside the second decision, and the recording is known there only as it was after the first.
+        assert torch.equal(played["next", "recorded", name][0], before["next", *key][0]), name
+    assert not torch.equal(played["next", "success_prob"], played["next", "recorded", "success_prob"])
     (end,) = (each for each in hasty.divergences if each.field == "end")
     assert end.step == 9 and "the recording ends at step 13, the replay at step 9" in str(hasty)
     lower = replay(tmp_path / "a.mcap", 0, world_model=model, reflector=judge, threshold=0.5, write=False)

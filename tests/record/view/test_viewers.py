@@ -91,6 +91,24 @@ def test_every_camera_is_shown_with_what_was_recorded_of_it(steps, tmp_path):
     assert topics == {f"/{kind}/{name}" for kind in ("observation", "recorded") for name in ("image", "wrist_image")}
 
 
+def test_a_replay_is_shown_with_the_curves_of_what_was_recorded_and_says_of_what_it_is_one(steps, tmp_path):
+    target = replay(steps, 1, target=tmp_path / "w.mcap", edits=parse_edit("3-20 gripper=-1")).target
+    (shown,) = shown_rollouts(target)
+    curves = {curve.name: curve for curve in shown.curves}
+    before = read_rollouts(steps, rollouts=1)[0]
+    before, played = before[before[keys.MASK]], read_rollouts(target)[0]
+    first = curves["recorded/state/position"].steps[0] - 1
+    opening = curves["recorded/state/position"].values[:, 3].float()
+    assert torch.equal(opening, before["next", keys.STATE][first:, 6])
+    assert not torch.equal(opening, played["next", keys.STATE][:, 6])
+    assert curves["recorded/success"].values.flatten().tolist() == before["next", "success"][first:].flatten().tolist()
+    assert shown.replayed == "a.mcap, rollout 1, in physics, changed from step 3 on"
+    assert next(shown_rollouts(steps, [1])).replayed == ""
+    layout = foxglove_layout(target)
+    assert layout["configById"]["Image!camera"]["foxglovePanelTitle"] == f"replay of {shown.replayed}"
+    assert foxglove_layout(steps)["configById"]["Image!camera"]["foxglovePanelTitle"] == "camera"
+
+
 def values_in(layout: dict) -> list[str]:
     return [line["value"] for panel in layout["configById"].values() for line in panel.get("paths", [])]
 
@@ -150,7 +168,7 @@ def test_the_layout_of_a_recording_names_only_topics_and_fields_that_are_in_it(k
         "steps": ["/step.reward", "/step.action[6]", "/annotation_1.advantage", "/step.observation_state[0]"],
         "decisions": ["/step.reward", "/step.vla_action_chunk[0]"],
         "recorder": ["/step.reward", "/step.termination", "/step.action[0]"],
-        "replay": ["/step.recorded_psnr", "/step.action[0]"],
+        "replay": ["/step.recorded_psnr", "/step.action[0]", "/step.recorded_state[0]", "/step.recorded_success"],
     }[kind]
     assert set(wanted) <= set(values_in(layout))
     assert ("Image!recorded" in panels) == (kind == "replay") and ("Image!wrist" in panels) == (

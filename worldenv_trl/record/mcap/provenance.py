@@ -22,7 +22,7 @@ from worldenv_trl.devices import device_of
 if TYPE_CHECKING:
     from worldenv_trl.scenes import Task
 
-__all__ = ["model_hash", "package_versions", "provenance"]
+__all__ = ["model_hash", "package_versions", "provenance", "replayed_from"]
 
 _PACKAGES = ("worldenv_trl", "torch", "torchrl", "tensordict", "mujoco", "dm-control", "numpy", "mcap")
 
@@ -199,3 +199,12 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic | torch.Tensor):
         return value.tolist()
     return value if isinstance(value, str | int | float | bool | None) else str(value)
+
+
+def replayed_from(metadata: Mapping[str, Any]) -> str:
+    """Of a replay's metadata what it is a replay of, in words; empty for any other recording."""
+    about = metadata.get("replay")
+    if about is None:
+        return ""
+    changed = f", changed from step {about['branch']['step']} on" if about["branch"] else ""
+    return f"{about['source']}, rollout {about['rollout']}, in {about['mode']}{changed}"

@@ -14,15 +14,16 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from worldenv_trl.devices import device_of
-from worldenv_trl.keys import FRAMES, MASK, NUM_STEPS, SUCCESS, SUCCESS_PROB
+from worldenv_trl.keys import MASK, NUM_STEPS, SUCCESS, SUCCESS_PROB
 from worldenv_trl.record.mcap.provenance import model_hash, package_versions
 from worldenv_trl.record.mcap.reader import list_rollouts, read_attachments, read_rollouts
 from worldenv_trl.record.mcap.recording import Recording
 from worldenv_trl.record.mcap.writer import RolloutWriter
+from worldenv_trl.record.replay.beside import laid_beside
 from worldenv_trl.record.replay.branch import Branch, check_edits
 from worldenv_trl.record.replay.physics import replay_physics, state_parts
 from worldenv_trl.record.replay.report import Divergence, ReplayReport, compare, frame_psnr
-from worldenv_trl.record.replay.source import Source, image_entries, observed, open_rollout
+from worldenv_trl.record.replay.source import Source, observed, open_rollout
 
 if TYPE_CHECKING:
     from worldenv_trl.reflectors import Reflector, StopRule
@@ -350,22 +351,8 @@ def _write(
     overwrite: bool,
     models: Mapping[str, torch.nn.Module | None],
 ) -> None:
-    """The replay as a recording, each step with its recorded image and the difference between both."""
-    played = played.copy()
-    have = played.keys(True, True)
-    for name in image_entries(played):
-        if name not in recorded or ("next", "observation", name) not in have:
-            continue
-        steps, images = recorded[name]
-        chunk = played["next", FRAMES, name].shape[1] if ("next", FRAMES, name) in have else 1
-        shown = report.first_step + 1 + torch.arange(len(played) * chunk)  # the steps of the played images
-        place = (torch.searchsorted(steps, shown, right=True) - 1).clamp(min=0)  # the last one that is known
-        shape = (len(played),) if chunk == 1 else (len(played), chunk)
-        key = (name,) if chunk == 1 else (FRAMES, name)
-        played["next", "recorded", *key] = images[place].reshape(*shape, *images.shape[1:])
-        # Equal frames have an infinite PSNR, which no viewer plots.
-        psnr = torch.tensor([min(report.psnr.get(step, float("nan")), 100.0) for step in shown.tolist()])
-        played["next", "recorded", "psnr"] = psnr.reshape(len(played), chunk)
+    """The replay as a recording, each step with what was recorded of it."""
+    played = laid_beside(played, recorded, report.first_step, report.psnr)
     imagined, taking_part = report.mode == "imagination", [model for model in models.values() if model is not None]
     described = dict(source.metadata) | {
         "versions": package_versions(),

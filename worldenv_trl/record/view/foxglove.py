@@ -9,7 +9,8 @@ import re
 from importlib.resources import files
 from typing import Any
 
-from worldenv_trl.record.mcap.reader import _require_file
+from worldenv_trl.record.mcap.provenance import replayed_from
+from worldenv_trl.record.mcap.reader import _require_file, read_metadata
 from worldenv_trl.record.mcap.recording import Recording
 
 __all__ = ["foxglove_layout", "foxglove_paths"]
@@ -22,7 +23,7 @@ def foxglove_layout(path: str | os.PathLike | None = None) -> dict[str, Any]:
     """The layout that ships with this package, as Foxglove imports it; for ``path``, what that recording holds of it.
 
     Panels and plotted values of topics and fields that the recording lacks are left out, so that none shows an error;
-    cameras that the layout does not know get a panel, too.
+    cameras that the layout does not know get a panel, too. A replay's camera says what it is a replay of.
 
     Raises:
         FileNotFoundError, ValueError: as :func:`~worldenv_trl.record.read_rollouts`.
@@ -50,6 +51,9 @@ def foxglove_layout(path: str | os.PathLike | None = None) -> dict[str, Any]:
         if not keep:
             del panels[name]
     layout["layout"] = _pruned(layout["layout"], set(panels))
+    replayed = replayed_from(read_metadata(path))
+    if replayed and "Image!camera" in panels:
+        panels["Image!camera"]["foxglovePanelTitle"] = f"replay of {replayed}"
     return layout
 
 

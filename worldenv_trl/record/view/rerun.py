@@ -22,12 +22,13 @@ __all__ = ["APPLICATION", "require_rerun", "rerun_blueprint", "rerun_recording"]
 APPLICATION = "worldenv_trl"
 # Plots from top to bottom: title, and the entries that belong to it.
 PLOTS: tuple[tuple[str, tuple[str, ...]], ...] = (
-    ("outcome", ("reward", "success", "success_prob")),
+    ("outcome", ("reward", "success", "success_prob", "recorded/success", "recorded/success_prob")),
     ("difference from the recording (PSNR, dB)", ("recorded/psnr",)),
     ("action", ("action", "vla_action/chunk")),
     ("policy", ("vla_action/log_probs", "advantage", "ratio", "clipped")),
     ("scale", ("vla_action/scale",)),
     ("hand", ("observation/state/position", "states/position", "predicted_state/position")),
+    ("recorded hand", ("recorded/state/position",)),
 )
 _COLORS = np.array(  # told apart on dark and on light ground
     [[230, 80, 60], [70, 170, 80], [70, 130, 220], [240, 170, 50], [160, 90, 200], [60, 190, 200], [220, 120, 170]]
@@ -136,6 +137,7 @@ def _send(rr: Any, stream: Any, rollout: Shown, named: set[str], gap: bool) -> N
     stream.set_time("time", duration=rollout.start)
     stream.set_time("step", sequence=0)
     said = f"rollout {rollout.number}: {rollout.instruction}" + (f" -> {rollout.outcome}" if rollout.outcome else "")
+    said += f" (a replay of {rollout.replayed})" if rollout.replayed else ""
     stream.log("text", rr.TextLog(said))
     stream.reset_time()
 

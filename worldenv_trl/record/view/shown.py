@@ -28,6 +28,7 @@ from worldenv_trl.keys import (
     TERMINATION,
     TERMINATIONS,
 )
+from worldenv_trl.record.mcap.provenance import replayed_from
 from worldenv_trl.record.mcap.reader import read_rollouts
 from worldenv_trl.record.mcap.recording import Recording
 from worldenv_trl.record.mcap.stream import painted
@@ -59,7 +60,8 @@ class Shown:
     """One rollout for the eye; ``start`` is when it plays in its file (s), a step takes 1 / 20 s.
 
     ``images``: name -> steps [n] and frames uint8 [n, 3, H, W], for each camera and, in a replay, what was recorded of
-    it (``recorded/<name>``), and ``action_map``; ``states`` float [n, 7] after ``state_steps``.
+    it (``recorded/<name>``), and ``action_map``; ``states`` float [n, 7] after ``state_steps``. ``replayed``: what it
+    is a replay of, empty if it is none.
     """
 
     number: int
@@ -70,6 +72,7 @@ class Shown:
     state_steps: Tensor
     states: Tensor
     curves: list[Curve]
+    replayed: str = ""
 
     def seconds(self, steps: Tensor) -> Tensor:
         return self.start + steps.double() / CONTROL_HZ
@@ -117,7 +120,8 @@ def _shown(entries: TensorDict, number: int, start: float, metadata: dict[str, A
     state_steps, states = seen.get("state", (torch.zeros(0, dtype=torch.int64), torch.zeros(0, 7)))
     words = entries.get(INSTRUCTION, "")
     words = words if isinstance(words, str) else (words.tolist() or [""])[0]
-    return Shown(number, start, words, _outcome(entries, have), images, state_steps, states, _curves(entries))
+    outcome, curves = _outcome(entries, have), _curves(entries)
+    return Shown(number, start, words, outcome, images, state_steps, states, curves, replayed_from(metadata))
 
 
 def _steps(entries: TensorDict) -> tuple[Tensor, Tensor]:
