@@ -247,10 +247,9 @@ def test_the_reflector_stops_where_it_did_and_another_threshold_stops_elsewhere(
 
     hasty = replay(tmp_path / "a.mcap", 0, world_model=model, reflector=Hasty())
     played, before = read_rollouts(hasty.target)[0], read_rollouts(tmp_path / "a.mcap", rollouts=0)[0]
-    for name in ("success_prob", "state"):  # what was recorded lies beside it, decision by decision
-        key = keys.STATE if name == "state" else (name,)
+    for path in (keys.STATE, ("success_prob",)):  # what was recorded lies beside it, decision by decision
         # The replay ends inside the second decision, and the recording is known there only as it was after the first.
-        assert torch.equal(played["next", "recorded", name][0], before["next", *key][0]), name
+        assert torch.equal(played["next", "recorded", path[-1]][0], before["next", *path][0]), path
     assert not torch.equal(played["next", "success_prob"], played["next", "recorded", "success_prob"])
     (end,) = (each for each in hasty.divergences if each.field == "end")
     assert end.step == 9 and "the recording ends at step 13, the replay at step 9" in str(hasty)

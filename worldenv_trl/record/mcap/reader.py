@@ -95,15 +95,6 @@ def read_rollouts(
     return out if keys is None else _selected(out, keys, recordings, path)
 
 
-def _part_of(rollouts: TensorDict, steps: slice, path: str | os.PathLike) -> TensorDict:
-    part = rollouts[..., steps]
-    if not part.shape[-1]:
-        raise ValueError(
-            f"steps={steps} chooses none: the longest rollout asked for of {path} has {rollouts.shape[-1]} steps"
-        )
-    return part
-
-
 def list_rollouts(path: str | os.PathLike, *, replays: bool = False) -> list[RolloutInfo]:
     """What each rollout is: file, number, time, entries, instruction, row. Frames are not decoded.
 
@@ -129,6 +120,15 @@ def read_attachments(path: str | os.PathLike) -> dict[str, bytes]:
 
 
 # ------------------------------------------------------------------------------------------------- selecting
+
+
+def _part_of(rollouts: TensorDict, steps: slice, path: str | os.PathLike) -> TensorDict:
+    part = rollouts[..., steps]
+    if not part.shape[-1]:
+        raise ValueError(
+            f"steps={steps} chooses none: the longest rollout asked for of {path} has {rollouts.shape[-1]} steps"
+        )
+    return part
 
 
 def _read(recording: Recording, keep: Callable | None, wanted: Callable[[_Path], bool]) -> list[Part]:

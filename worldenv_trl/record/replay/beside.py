@@ -8,12 +8,12 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from worldenv_trl.keys import FRAMES, STATE, STEP_MASK, SUCCESS, SUCCESS_PROB
-from worldenv_trl.record.replay.source import image_entries
+from worldenv_trl.keys import FRAMES, STATE, SUCCESS, SUCCESS_PROB
+from worldenv_trl.record.replay.source import image_entries, steps_around
 
 __all__ = ["laid_beside"]
 
-_PLOTTED = (SUCCESS, SUCCESS_PROB, STATE[-1])
+_PLOTTED = ((SUCCESS,), (SUCCESS_PROB,), STATE)
 _EQUAL_DB = 100.0  # of equal frames, whose PSNR is infinite: no viewer plots that
 
 
@@ -44,15 +44,11 @@ def laid_beside(
         out["next", "recorded", *key] = images[_last_known(steps, shown)].reshape(*shape, *images.shape[1:])
         decibels = torch.tensor([min(psnr.get(step, float("nan")), _EQUAL_DB) for step in shown.tolist()])
         out["next", "recorded", "psnr"] = decibels.reshape(len(played), chunk)
-    executed = torch.ones(len(played), dtype=torch.int64)
-    if ("next", STEP_MASK) in have:
-        executed = played["next", STEP_MASK].sum(-1)
-    after = first_step + executed.cumsum(0)
-    shown_too = {key[-1] for key in have if isinstance(key, tuple) and key[0] == "next"}
-    for name in _PLOTTED:
-        if name in recorded and name in shown_too:
-            steps, values = recorded[name]
-            out["next", "recorded", name] = values[_last_known(steps, after)]
+    after = steps_around(played, first_step)[1]
+    for path in _PLOTTED:
+        if path[-1] in recorded and ("next", *path) in have:
+            steps, values = recorded[path[-1]]
+            out["next", "recorded", path[-1]] = values[_last_known(steps, after)]
     return out
 
 

@@ -41,7 +41,7 @@ from worldenv_trl.record.mcap.tasks import task_names, task_numbers
 if TYPE_CHECKING:
     from worldenv_trl.scenes import Task
 
-__all__ = ["Source", "image_entries", "observed", "open_rollout", "recorded_task"]
+__all__ = ["Source", "image_entries", "observed", "open_rollout", "recorded_task", "steps_around"]
 
 
 @dataclass(frozen=True)
@@ -149,6 +149,15 @@ def image_entries(entries: TensorDictBase) -> list[str]:
     return sorted(names, key=lambda name: (first.index(name) if name in first else len(first), name))
 
 
+def steps_around(entries: TensorDictBase, first: int = 0) -> tuple[Tensor, Tensor]:
+    """Env steps executed before and after each of the entries [T], which follow ``first`` steps: int64 [T] each."""
+    executed = torch.ones(len(entries), dtype=torch.int64)
+    if ("next", STEP_MASK) in entries.keys(True, True):
+        executed = entries["next", STEP_MASK].sum(-1)
+    last = first + executed.cumsum(0)
+    return last - executed, last
+
+
 def observed(entries: TensorDictBase, first: int = 0) -> dict[str, tuple[Tensor, Tensor]]:
     """What entries [T] show, by name: after how many env steps int64 [n], and the values [n, ...].
 
@@ -157,13 +166,12 @@ def observed(entries: TensorDictBase, first: int = 0) -> dict[str, tuple[Tensor,
     """
     have = set(entries.keys(True, True))
     mask = entries["next", STEP_MASK] if ("next", STEP_MASK) in have else None
-    executed = torch.ones(len(entries), dtype=torch.int64) if mask is None else mask.sum(-1)
-    last = first + executed.cumsum(0)
+    last = steps_around(entries, first)[1]
     out = {}
     for path, between in _compared(entries):
         key = path if len(path) > 1 else path[0]
         if between is not None and ("next", *between) in have and mask is not None:
-            steps, values = first + 1 + torch.arange(int(executed.sum())), entries["next", *between][mask]
+            steps, values = torch.arange(first + 1, int(last[-1]) + 1), entries["next", *between][mask]
         elif ("next", *path) in have:
             steps, values = last, entries["next", *path]
         else:

@@ -10,7 +10,7 @@ from importlib.resources import files
 from typing import Any
 
 from worldenv_trl.record.mcap.provenance import replayed_from
-from worldenv_trl.record.mcap.reader import _require_file, read_metadata
+from worldenv_trl.record.mcap.reader import _require_file
 from worldenv_trl.record.mcap.recording import Recording
 
 __all__ = ["foxglove_layout", "foxglove_paths"]
@@ -31,7 +31,8 @@ def foxglove_layout(path: str | os.PathLike | None = None) -> dict[str, Any]:
     layout = json.loads(files("worldenv_trl.record.view").joinpath("foxglove_layout.json").read_text())
     if path is None:
         return layout
-    have = foxglove_paths(path)
+    recording = Recording(_require_file(path))
+    have = _paths(recording)
     panels = layout["configById"]
     shown = {panel["imageMode"]["imageTopic"] for name, panel in panels.items() if name.startswith("Image!")}
     for topic in sorted(have):
@@ -51,7 +52,7 @@ def foxglove_layout(path: str | os.PathLike | None = None) -> dict[str, Any]:
         if not keep:
             del panels[name]
     layout["layout"] = _pruned(layout["layout"], set(panels))
-    replayed = replayed_from(read_metadata(path))
+    replayed = replayed_from(recording.metadata)
     if replayed and "Image!camera" in panels:
         panels["Image!camera"]["foxglovePanelTitle"] = f"replay of {replayed}"
     return layout
@@ -77,7 +78,10 @@ def _beside(tree: Any, panel: str, other: str) -> Any:
 
 def foxglove_paths(path: str | os.PathLike) -> dict[str, dict[str, int]]:
     """The topics of a recording, with how many values each plottable field has: ``{"/step": {"reward": 1}}``."""
-    recording = Recording(_require_file(path))
+    return _paths(Recording(_require_file(path)))
+
+
+def _paths(recording: Recording) -> dict[str, dict[str, int]]:
     for chunk in recording.scan.chunks:  # a file that was cut off names its channels in its chunks only
         if not recording.scan.channels or not recording.scan.intact:
             for _ in recording.scan.messages(chunk):

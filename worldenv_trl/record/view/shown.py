@@ -34,7 +34,7 @@ from worldenv_trl.record.mcap.recording import Recording
 from worldenv_trl.record.mcap.stream import painted
 from worldenv_trl.record.mcap.tasks import task_names, task_numbers
 from worldenv_trl.record.replay.branch import ACTION_NAMES
-from worldenv_trl.record.replay.source import image_entries, observed
+from worldenv_trl.record.replay.source import image_entries, observed, steps_around
 from worldenv_trl.robot import Camera
 
 __all__ = ["Curve", "Shown", "shown_rollouts"]
@@ -72,7 +72,7 @@ class Shown:
     state_steps: Tensor
     states: Tensor
     curves: list[Curve]
-    replayed: str = ""
+    replayed: str
 
     def seconds(self, steps: Tensor) -> Tensor:
         return self.start + steps.double() / CONTROL_HZ
@@ -102,17 +102,17 @@ def _file(path: str | os.PathLike) -> Path:
 
 def _shown(entries: TensorDict, number: int, start: float, metadata: dict[str, Any]) -> Shown:
     seen = observed(entries)
-    first = _steps(entries)[0]
+    first = steps_around(entries)[0]
     have = set(entries.keys(True, True))
     images = {}
     for name in image_entries(entries):
         images[name] = seen[name]
         if ("next", "recorded", name) in have:
-            images[f"recorded/{name}"] = _steps(entries)[1], entries["next", "recorded", name]
+            images[f"recorded/{name}"] = steps_around(entries)[1], entries["next", "recorded", name]
         if ("next", "recorded", FRAMES, name) in have:
             images[f"recorded/{name}"] = _per_step(entries, entries["next", "recorded", FRAMES, name], first)
     if ("next", ACTION_MAP) in have:
-        images["action_map"] = _steps(entries)[1], entries["next", ACTION_MAP]
+        images["action_map"] = steps_around(entries)[1], entries["next", ACTION_MAP]
     elif "kinematic_state" in seen and IMAGE[1] in images:
         drawn = _drawn(entries, seen["kinematic_state"][1], images[IMAGE[1]][1].shape[-1], metadata)
         if drawn is not None:
@@ -124,15 +124,6 @@ def _shown(entries: TensorDict, number: int, start: float, metadata: dict[str, A
     return Shown(number, start, words, outcome, images, state_steps, states, curves, replayed_from(metadata))
 
 
-def _steps(entries: TensorDict) -> tuple[Tensor, Tensor]:
-    """Env steps executed before and after each entry, int64 [T]."""
-    executed = torch.ones(len(entries), dtype=torch.int64)
-    if ("next", STEP_MASK) in entries.keys(True, True):
-        executed = entries["next", STEP_MASK].sum(-1)
-    last = executed.cumsum(0)
-    return last - executed, last
-
-
 def _per_step(entries: TensorDict, values: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
     """Values [T, C, ...] of what was executed, with the steps after which they hold."""
     mask = entries["next", STEP_MASK]
@@ -141,7 +132,7 @@ def _per_step(entries: TensorDict, values: Tensor, first: Tensor) -> tuple[Tenso
 
 def _curves(entries: TensorDict) -> list[Curve]:
     have = set(entries.keys(True, True))
-    first, last = _steps(entries)
+    first, last = steps_around(entries)
     length = entries["next", STEP_MASK].shape[1] if ("next", STEP_MASK) in have else 0
     curves = []
     for key in sorted(have, key=str):
