@@ -18,8 +18,7 @@ from torch import Tensor
 
 import processes
 from data_parallel import DataParallel, WholeOptimizer
-from episodes import recorded_episodes, round_of
-from explore import rows_of_scale
+from episodes import explored_at, round_of
 from imagining import imagined
 from physics import exploring_actor
 from resumable import Resumable
@@ -75,16 +74,14 @@ def sampled_as_in_loop(run: Run, number: int) -> Episodes:
     """``adapt.episodes_per_task`` explored episodes of each task, or all there are: drawn from the scales that LOOP's
     does not exceed, or from all if there is none."""
     explore, wanted = run.config.explore, run.config.post_train.scale_factor
-    every = recorded_episodes(run, number)[-1]
     usual = [factor for factor in explore.scale_factors if factor <= wanted] or explore.scale_factors
-    rows = torch.arange(len(every))
-    pool = torch.cat([rows[rows_of_scale(explore, len(run.config.tasks), factor)] for factor in usual])
-    tasks = every[keys.TASK_ID].squeeze(-1)[pool]
+    pool = explored_at(run, number, usual)
+    tasks = pool[keys.TASK_ID].squeeze(-1)
     chosen = []
     for task in tasks.unique():
-        own = pool[tasks == task]
+        own = (tasks == task).nonzero().squeeze(-1)
         chosen.append(own[torch.randperm(len(own))[: run.config.adapt.episodes_per_task]])
-    return every[torch.cat(chosen)]
+    return pool[torch.cat(chosen)]
 
 
 class Decisions:

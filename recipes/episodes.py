@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterable
 
 import torch
 
 import processes
+from explore import rows_of_scale
 from run import Run
 from worldenv_trl import keys
 from worldenv_trl.data import Episodes, episodes_from_rollouts, fill_store, open_store
@@ -44,6 +46,14 @@ def recorded_episodes(run: Run, rounds: int) -> list[Episodes]:
             print(f"{str(error).split(': fill_store')[0]}: it is made anew from the recordings")
             parts = fill_store(store, files)
     return parts
+
+
+def explored_at(run: Run, number: int, factors: Iterable[float]) -> Episodes:
+    """What round ``number`` explored at these factors of the scale; frames as above."""
+    explored = recorded_episodes(run, number)[-1]
+    rows = torch.arange(len(explored))
+    tasks = len(run.config.tasks)
+    return explored[torch.cat([rows[rows_of_scale(run.config.explore, tasks, factor)] for factor in factors])]
 
 
 def split_by_context(episodes: Episodes, share: float, seed: int) -> tuple[Episodes, Episodes]:

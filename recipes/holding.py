@@ -15,8 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from episodes import recorded_episodes, round_of
-from explore import rows_of_scale
+from episodes import explored_at, round_of
 from physics import exploring_actor
 from run import Run
 from updates import rows_of
@@ -35,7 +34,7 @@ class Hold:
     def __init__(self, run: Run, source: str, models: str) -> None:
         policy = run.policy(source).eval()
         self._actor = exploring_actor(run.config, policy, run.config.post_train.scale_factor)
-        shares = solved_shares(greedy_exploration(run, round_of(models)))
+        shares = solved_shares(explored_at(run, round_of(models), [0.0]))
         self._tasks = torch.tensor(
             [task for task, share in shares.items() if share >= run.config.post_train.hold_from], dtype=torch.long
         )
@@ -61,12 +60,6 @@ class Hold:
             found: Any = self._actor.get_dist(decisions[rows].select(*self._actor.policy.in_keys))
             loc[rows], scale[rows] = found.loc, found.scale
         decisions[keys.REFERENCE_LOC], decisions[keys.REFERENCE_SCALE] = loc, scale
-
-
-def greedy_exploration(run: Run, number: int) -> Episodes:
-    """Exploration's rollouts without noise, of round ``number``."""
-    rows = rows_of_scale(run.config.explore, len(run.config.tasks), 0.0)
-    return recorded_episodes(run, number)[-1][rows]
 
 
 def solved_shares(episodes: Episodes) -> dict[int, float]:

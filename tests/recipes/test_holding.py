@@ -6,20 +6,16 @@ import dataclasses
 
 import pytest
 import torch
-from small_run import SMALL, small_untrained, token_policy, with_untrained_policy
+from small_run import SMALL, token_policy, with_untrained_policy
 from tensordict import TensorDict
 
-import config
 import holding
 from checks import check_config, check_loop
-from demonstrate import demonstrate
-from explore import explore
-from holding import Hold, greedy_exploration, solved_shares
-from physics import exploring_actor, reached_goal
+from holding import Hold, solved_shares
+from physics import exploring_actor
 from post_train import post_train
 from run import Run
 from worldenv_trl import keys
-from worldenv_trl.record import read_rollouts
 
 
 def episodes(tasks, successes):
@@ -32,38 +28,6 @@ def episodes(tasks, successes):
 def test_a_share_is_of_all_rollouts_of_a_task():
     shares = solved_shares(episodes([2, 0, 2, 0, 2, 5], [1, 1, 0, 1, 0, 0]))
     assert shares == {0: 1.0, 2: pytest.approx(1 / 3), 5: 0.0}
-
-
-@pytest.fixture(scope="module")
-def explored(tmp_path_factory):
-    """An exploration whose second scale is greedy, and the demonstrations that are stored with it."""
-    run = small_untrained(
-        tmp_path_factory.mktemp("holding"),
-        max_steps=40,
-        explore=config.Explore(episodes_per_task=4, num_envs=2, scale_factors=(1.0, 0.0), replay_share=0.0),
-    )
-    demonstrate(run)
-    explore(run)
-    yield run
-    run.close()
-
-
-def test_greedy_exploration_is_the_part_without_noise(explored):
-    greedy = greedy_exploration(explored, 1)
-    every = read_rollouts(explored.folder.rollouts("explore"))
-    policy = explored.policy("sft").eval()
-    assert 0 < len(greedy) < len(every)
-    own = every[-len(greedy) :]  # of two scales, the second
-    assert torch.equal(greedy[keys.CONTEXT_ID], own[keys.CONTEXT_ID][:, 0])
-    with torch.no_grad():
-        mean = exploring_actor(explored.config, policy, 1.0).get_dist(own[:, 0]).loc[:, 0]
-    torch.testing.assert_close(own[keys.ACTION][:, 0], mean.clamp(-1, 1), atol=1e-4, rtol=0)
-    noisy = every[: -len(greedy)]
-    with torch.no_grad():
-        mean = exploring_actor(explored.config, policy, 1.0).get_dist(noisy[:, 0]).loc[:, 0]
-    assert (noisy[keys.ACTION][:, 0] - mean).abs().mean() > 0.01
-    succeeded = greedy[keys.SUCCESS].flatten(1).any(-1)
-    assert torch.equal(succeeded, reached_goal(own))
 
 
 def test_what_cannot_be_held_is_refused_before_any_work():
@@ -84,9 +48,7 @@ def physics(tiny):
 def learned(run, monkeypatch, weight, solved):
     """The weights after LOOP, held with ``weight`` if greedy rollouts solved this share, and what was logged."""
     monkeypatch.setattr(Run, "seed", lambda *_: 1)
-    monkeypatch.setattr(
-        holding, "greedy_exploration", lambda *_: episodes([0] * 20, [n < 20 * solved for n in range(20)])
-    )
+    monkeypatch.setattr(holding, "explored_at", lambda *_: episodes([0] * 20, [n < 20 * solved for n in range(20)]))
     settings = dataclasses.replace(run.config.post_train, hold=weight)
     run = dataclasses.replace(run, config=dataclasses.replace(run.config, post_train=settings))
     name = f"held_{weight}_{solved}"
@@ -108,7 +70,7 @@ def test_a_task_that_is_held_stays_and_one_that_is_not_is_learned_as_without(phy
 
 
 def test_the_reference_is_what_the_source_does_at_held_decisions_alone(physics, monkeypatch):
-    monkeypatch.setattr(holding, "greedy_exploration", lambda *_: episodes([4, 5], [0, 1]))
+    monkeypatch.setattr(holding, "explored_at", lambda *_: episodes([4, 5], [0, 1]))
     hold = Hold(physics, "sft", "")
     wave = TensorDict({keys.TASK_ID: torch.tensor([4, 5]).view(2, 1, 1, 1).expand(2, 3, 4, 1)}, [2, 3, 4])
     assert hold.groups(wave).tolist() == [False, True]

@@ -313,9 +313,9 @@ class PathReflector(Reflector, Pretrained):
 
         Args:
             batch: [P] of one lesson. Of ``paths``: ``crops`` floats [P, L, 3 V, S, S], ``path`` [P, L, 26 + F],
-                ``words`` int64 [P, W], ``label`` bool [P, L], ``asked`` int64 [P], a look, and ``weight`` [P, L]: 1 up
-                to the episode's end, 0 behind it. Of ``places``: ``first`` uint8 [P, V, 3, H, W], ``view`` int64
-                [P, V], ``words``, ``levels`` [P, K] (m) and ``place`` [P, K, 3] (m).
+                ``words`` int64 [P, W], ``label`` bool [P, L], ``weight`` [P, L]: 1 up to the episode's end, 0 behind
+                it; with ``open_loop_frames`` ``asked`` int64 [P], a look. Of ``places``: ``first`` uint8
+                [P, V, 3, H, W], ``view`` int64 [P, V], ``words``, ``levels`` [P, K] (m) and ``place`` [P, K, 3] (m).
         """
         if "place" in batch.keys():  # noqa: SIM118
             return self._places_loss(batch)

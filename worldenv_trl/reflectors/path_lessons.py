@@ -117,21 +117,20 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
             crops.append(((seen + 0.5) * 255).round().to(torch.uint8))
             points.append(reflector.places(frames, view[here], words[here], levels[here])[1])
     looks, moves, hands, there = torch.cat(crops), reflector.moves(poses), poses[..., :3], torch.cat(points)
-    asked = reflector.asked(hands)
+    told = {"words": words, "label": label, "weight": weight}
+    if reflector.config.open_loop_frames:
+        told["asked"] = reflector.asked(hands)
 
     def sample_paths() -> TensorDict:
         rows = _drawn(tasks, plan.batch_size).to(device)
         light = 1 + _LIGHT * torch.randn(len(rows), 1, 1, 1, 1, device=device)
-        told, beside = moves[rows], _BESIDE * torch.randn(len(rows), 1, 3, device=device)
+        moved, beside = moves[rows], _BESIDE * torch.randn(len(rows), 1, 3, device=device)
         apart = offsets(hands[rows] + beside, there[rows])
         return TensorDict(
             {
                 "crops": light * (looks[rows].float() / 255 - 0.5),
-                "path": torch.cat([told + _PATH_NOISE * torch.randn_like(told), apart], -1),
-                "words": words[rows],
-                "label": label[rows],
-                "asked": asked[rows],
-                "weight": weight[rows],
+                "path": torch.cat([moved + _PATH_NOISE * torch.randn_like(moved), apart], -1),
+                **{name: value[rows] for name, value in told.items()},
             },
             batch_size=[len(rows)],
         )
