@@ -278,6 +278,12 @@ def test_imagination_is_judged_by_the_one_that_judged_it(tmp_path):
     imagine(tmp_path / "a.mcap", model, reflector=judge.imagined)
     same = replay(tmp_path / "a.mcap", 0, world_model=model, reflector=judge, write=False)
     assert same.exact is True and "success_prob" in same.compared and not same.notes
+    lived = replay(tmp_path / "a.mcap", 0, mode="physics", reflector=judge, write=False)
+    assert "the reflector's other part judges this world: its R is not the recorded one's" in lived.notes
+    another = OfTwo()
+    another.imagined.weight = torch.nn.Parameter(torch.zeros(1))
+    lived = replay(tmp_path / "a.mcap", 0, mode="physics", reflector=another, write=False)
+    assert any("the reflector is not the recorded one" in note for note in lived.notes)
 
 
 def test_an_edit_is_told_apart_from_another_model(tmp_path):
@@ -287,6 +293,9 @@ def test_an_edit_is_told_apart_from_another_model(tmp_path):
     assert report.first.step == 10 and all(report.psnr[step] == float("inf") for step in range(10))
     nothing = replay(tmp_path / "a.mcap", 0, world_model=other, seed=0, from_step=16 - C, write=False)
     assert nothing.first.step == 16 - C + 1  # other noise from the branch on
+    inside = replay(tmp_path / "a.mcap", 0, world_model=other, seed=0, from_step=16 - 1, write=False)
+    assert inside.divergences == nothing.divergences and f"branch at step {16 - C}:" in str(inside)
+    assert f"a decision takes {C} steps: the branch is at step {16 - C}, not 15" in inside.notes
 
 
 def test_before_the_branch_the_model_is_not_asked(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -116,8 +117,11 @@ def replay(
         raise FileExistsError(f"{target} exists: pass overwrite=True or another target")
 
     notes: list[str] = []
+    if branch is not None and mode == "imagination" and world_model is not None:
+        branch = _of_a_decision(branch, world_model.chunk_length, notes)
     recorded = observed(source.entries)
-    reflector = None if reflector is None else _judge(source, reflector, mode)
+    given = reflector
+    reflector = None if given is None else _judge(source, given, mode)
     rule = _rule(source, reflector)
     unchanged = None
     with torch.random.fork_rng(devices=[]):  # a branch seeds the policy's samples
@@ -131,8 +135,8 @@ def replay(
     if mode == "imagination" and source.imagined and world_model is not None:
         same = _same_model(source, "world_model", world_model, notes) and same
         same = _same_device(source, device_of(world_model).type, notes) and same
-    if reflector is not None:
-        same = _same_model(source, "reflector", reflector, notes) and same
+    if given is not None and reflector is not None:
+        same = _same_judge(source, given, reflector, notes) and same
     if kind == "exact" and (source.imagined != (mode == "imagination") or not same):
         kind = "difference"
     shown = observed(played, first)
@@ -148,6 +152,8 @@ def replay(
             words = f"without the change it ends at step {before}, with it at step {end}"
         divergences.append(Divergence(min(end, before), "end", abs(end - before), words))
         divergences.sort(key=lambda each: each.step)
+    elif end > before:
+        notes.append(f"without the reflector that stopped it the last chunk goes on to step {end}: pass it, too")
     report = ReplayReport(
         source=source.path,
         rollout=rollout,
@@ -205,6 +211,15 @@ def _branch(
     return branch if branch.changes else None
 
 
+def _of_a_decision(branch: Branch, length: int, notes: list[str]) -> Branch:
+    """In imagination policy and noise change from one decision of ``length`` steps to the next."""
+    past = branch.step % length
+    if not past or (branch.policy is None and branch.seed is None):
+        return branch
+    notes.append(f"a decision takes {length} steps: the branch is at step {branch.step - past}, not {branch.step}")
+    return replace(branch, step=branch.step - past)
+
+
 def _imagined(
     source: Source, branch: Branch | None, from_step: int, notes: list[str], **options: Any
 ) -> tuple[TensorDict, TensorDict | None]:
@@ -220,8 +235,6 @@ def _imagined(
     if branch is not None:
         # The change is told apart from another model and from rounding by playing both.
         unchanged = replay_imagination(rollouts, branch=Branch(branch.step), **options)[0]
-        if branch.step % length and (branch.policy is not None or branch.seed is not None):
-            notes.append(f"a decision takes {length} steps: the branch is at {branch.step - branch.step % length}")
         notes.append("compared with the same model without the change")
         return replay_imagination(rollouts, branch=branch, **options)[0], unchanged
     options["branch"] = Branch(from_step) if from_step else None  # earlier frames are taken as recorded
@@ -306,6 +319,14 @@ def _same_model(source: Source, name: str, model: torch.nn.Module, notes: list[s
             "differences are shown, equality is not claimed"
         )
     return recorded == given
+
+
+def _same_judge(source: Source, given: Reflector, judging: Reflector, notes: list[str]) -> bool:
+    there = given.for_world("imagined" if source.imagined else "real")
+    if source.models.get("reflector") == model_hash(there) != model_hash(judging):
+        notes.append("the reflector's other part judges this world: its R is not the recorded one's")
+        return False
+    return _same_model(source, "reflector", judging, notes)
 
 
 def _same_device(source: Source, given: str, notes: list[str]) -> bool:
