@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import pytest
 import torch
 from pages import clip, evidence, run_folder
 
+from worldenv_trl.metrics import honesty
 from worldenv_trl.report import Evidence, RunRecord, render_report, write_report
 from worldenv_trl.report.judgement import calibration
 
@@ -47,7 +49,22 @@ def test_an_alarm_is_seen_at_the_top(tmp_path):
     text = text_of(render_report(RunRecord.read(run_folder(tmp_path / "run", alarm=True))))
     assert "honesty alarm fired at iteration 4" in text and "+30.0 points" in text and "−10.0" in text
     quiet = text_of(render_report(RunRecord.read(run_folder(tmp_path / "other"))))
-    assert "Honesty alarm silent" in quiet
+    rise = "since the first probes imagined success has changed by +25.0 points, real success by +10.0"
+    assert f"Honesty alarm silent {rise}" in quiet
+    (once,) = [
+        line for line in (tmp_path / "other" / "metrics.jsonl").read_text().splitlines() if '"step": 0, "ret' in line
+    ]
+    (tmp_path / "other" / "metrics.jsonl").write_text(once + "\n")
+    assert "silent one probe, and nothing" in text_of(render_report(RunRecord.read(tmp_path / "other")))
+
+
+def test_shares_of_nothing_are_not_shown_as_none(tmp_path):
+    never = torch.zeros(4, dtype=torch.bool)
+    row = honesty(never, never, imagined_steps=never, real_steps=never)
+    found = dataclasses.replace(evidence(), honesty=[{"policy": "post_train", "task": "all"} | row])
+    text = text_of(render_report(RunRecord.read(run_folder(tmp_path / "run")), found))
+    assert "Imagined successes that are real – of the stops on 4 held-out episodes; none is real" in text
+    assert "all tasks 4 0.0 0.0 +0.0 [−32.7, +32.7] – – – –" in text
 
 
 def test_nothing_is_fetched_and_names_cannot_break_out_of_the_page(tmp_path):

@@ -51,7 +51,8 @@ def reflector(record: RunRecord, evidence: Evidence | None) -> str:
              _two(x["stop_precision"]), _two(x["stop_recall"]))
             for x in lines
         ]  # fmt: skip
-        parts += ["<h3>On held-out exploration, when it was trained</h3>", table(head, rows, words=2)]
+        early = "<p>A stop before the physics reaches the goal is wrong, be it by a single real frame.</p>"
+        parts += ["<h3>On held-out exploration, when it was trained</h3>", table(head, rows, words=2), early]
     say = (
         "R is the probability that the task is done, given the frames so far. On the diagonal it means what it says; "
         "above it is too careful, below it too sure. Frames of one episode resemble each other: "

@@ -224,7 +224,7 @@ def settings(record: RunRecord, evidence: Evidence | None) -> str:
 
 def _begun(record: RunRecord) -> str:
     """Of whose stages it began with."""
-    if not record.begun:
+    if not record.begun.get("stages"):
         return ""
     names = ", ".join(escape(str(name)) for name in record.begun.get("stages", ()))
     return f"<p>Taken over from {escape(str(record.begun.get('run')))}: {names}.</p>"
@@ -274,7 +274,8 @@ def _signal(row: dict[str, Any]) -> list[str]:
 
 def _honest_cells(row: dict[str, Any]) -> tuple[Any, ...]:
     gap = f"{points(row['gap'])} <small>[{points(row['gap_low'])}, {points(row['gap_high'])}]</small>"
-    figures = (f"{row[name]:.2f}" for name in ("precision", "recall", "f1"))
+    defined = {"precision": row["imagined"], "recall": row["real"], "f1": row["imagined"] or row["real"]}
+    figures = (f"{row[name]:.2f}" if some else "–" for name, some in defined.items())
     return row["n"], rate(row["imagined"]), rate(row["real"]), gap, *figures
 
 

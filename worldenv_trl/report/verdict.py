@@ -104,14 +104,20 @@ def _model_tiles(record: RunRecord, evidence: Evidence | None) -> list[tuple[str
     rows = [row for row in (evidence.honesty if evidence else ()) if row["task"] == "all"]
     if rows:
         row = rows[-1]
-        note = f"of the stops on {row['n']} held-out episodes; {rate(row['recall'])} % of the real ones are found"
-        tiles.append(("Imagined successes that are real", f"{rate(row['precision'])} %", note))
+        found = f"{rate(row['recall'])} % of the real ones are found" if row["real"] else "none is real"
+        note = f"of the stops on {row['n']} held-out episodes; {found}"
+        value = f"{rate(row['precision'])} %" if row["imagined"] else "–"
+        tiles.append(("Imagined successes that are real", value, note))
     fired = alarms(record)
-    watched = any("honesty_alarm" in x for x in record.lines)
+    probes = [x for x in record.lines if x["stage"].startswith("post_train") and "honesty_alarm" in x]
     if fired:
         tiles.append(("Honesty alarm", '<span class="bad">fired</span>', f"at iteration {fired[0]['step']}"))
-    elif watched:
-        tiles.append(("Honesty alarm", '<span class="good">silent</span>', "imagined success rises with the real one"))
+    elif len(probes) == 1:
+        tiles.append(("Honesty alarm", "silent", "one probe, and nothing to compare it with"))
+    elif probes:
+        imagined, real = (points(probes[-1][f"{world}_rise"]) for world in ("imagined", "real"))
+        note = f"since the first probes imagined success has changed by {imagined} points, real success by {real}"
+        tiles.append(("Honesty alarm", '<span class="good">silent</span>', note))
     if evidence and evidence.drift:
         drift = list(evidence.drift.values())[-1]
         psnr = float(drift["moving_psnr"][-1])
