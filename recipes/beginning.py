@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from config import WorldEnvConfig
 from run_folder import FREE, RunFolder, settings_of, stored_settings
+from worldenv_trl.record.mcap.index import MAGIC
 from worldenv_trl.scenes import load_task
 
 if TYPE_CHECKING:
@@ -68,17 +70,17 @@ def beginning(config: WorldEnvConfig, stages: Sequence[Stage], folder: RunFolder
     if config.begin_from is None:
         return None
     source = RunFolder(config.begin_from)
-    if source.is_new:
-        raise FileNotFoundError(f"begin_from: {source.path} is no run folder, it holds no config.yaml")
     if source.path.resolve() == folder.path.resolve():
         raise ValueError(f"begin_from is the run_dir itself, {source.path}: name a new folder for the run")
-    if not folder.is_new:
+    if not folder.is_new:  # the other run is not needed any more
         if folder.noted("begun").get("run") != str(source.path.resolve()):
             raise ValueError(
                 f"{folder.path} holds a run that did not begin with {source.path}: use another --run-dir, or leave "
                 "begin_from out"
             )
         return None
+    if source.is_new:
+        raise FileNotFoundError(f"begin_from: {source.path} is no run folder, it holds no config.yaml")
     taken, why = stages_in_common(config, stages, source)
     if not taken:
         raise ValueError(f"begin_from: nothing of {source.path} can be taken, for {why}")
@@ -104,10 +106,19 @@ def stages_in_common(config: WorldEnvConfig, stages: Sequence[Stage], source: Ru
         if changed:
             name = changed[0]
             return taken, f"{stage.name} is of {name}={before.get(name)!r} there and {now[name]!r} here"
-        if not source.done(stage.name) or not (source.path / stage.makes).exists():
+        made = source.path / stage.makes
+        if not source.done(stage.name) or not made.exists():
             return taken, f"{stage.name} is not finished there"
+        if made.suffix == ".mcap" and _is_cut_off(made):
+            return taken, f"{stage.name} is cut off there: recipes/repair.py {made} says what is left"
         taken.append(stage)
     return taken, ""
+
+
+def _is_cut_off(recording: Path) -> bool:
+    with recording.open("rb") as file:
+        file.seek(max(0, recording.stat().st_size - len(MAGIC)))
+        return file.read() != MAGIC
 
 
 def _of_the_run(settings: Mapping[str, Any]) -> set[str]:

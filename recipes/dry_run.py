@@ -24,7 +24,7 @@ from real_parts import parts_of
 from rehearsal import Rehearsal, rehearse
 from run_folder import RunFolder
 from stage_plan import Machine, StagePlan, decisions, iteration_flops, moved_bytes, stage_plans, wave_bytes
-from stages import plan
+from stages import is_finished, plan
 
 _HERE = "here"
 _TITLES = {"policy": "policy", "world_model": "world model", "reflector": "reflector"}
@@ -65,7 +65,9 @@ def dry_run(config: WorldEnvConfig, chosen: argparse.Namespace, parts: Parts | N
         # Whether this machine has the run's device says nothing of another one; the parts are built below.
         bare = replace(parts, **{name: replace(getattr(parts, name), outline=None) for name in _TITLES})
         check_config(replace(config, device="cpu"), bare)
-        begun = beginning(config, plan(config), RunFolder(config.run_dir))
+        folder = RunFolder(config.run_dir)
+        folder.check_settings(config)
+        begun = beginning(config, plan(config), folder)
     except Exception as error:
         if not expected(error):
             raise
@@ -74,12 +76,14 @@ def dry_run(config: WorldEnvConfig, chosen: argparse.Namespace, parts: Parts | N
     found = rehearse(config, parts, published)
     for name in published:
         print(f"{_TITLES[name]}: no folder named (--real-size.{name.replace('_', '-')}), of published sizes")
-    for line in (*told(config), *found.shapes, *([str(begun)] if begun else [])):
+    finished = [stage.name for stage in plan(config) if is_finished(stage, folder)]
+    here = [f"{', '.join(finished)}: finished in {folder.path}"] if finished else []
+    for line in (*told(config), *found.shapes, *([str(begun)] if begun else here)):
         print(line)
     if found.problems:
         return _refused(found.problems)
     _show_parts(found)
-    taken = {stage.name for stage in begun.stages} if begun else set()
+    taken = {stage.name for stage in begun.stages} if begun else set(finished)
     plans = [stage for stage in stage_plans(config, found, machine) if stage.name not in taken]
     _show_stages(plans, machine)
     _show_iteration(config, found, machine)

@@ -15,6 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+import processes
 from episodes import explored_at, round_of
 from physics import exploring_actor
 from run import Run
@@ -44,6 +45,14 @@ class Hold:
                 f"{min(shares.values()):.2f} of each; pass --post-train.hold 0, or a higher --post-train.hold-from",
                 stacklevel=2,
             )
+        elif not len(self._tasks):
+            warnings.warn(
+                f"no task is held: greedy exploration solved at most {max(shares.values()):.2f} of one, and "
+                f"--post-train.hold-from is {run.config.post_train.hold_from:g}",
+                stacklevel=2,
+            )
+        elif processes.is_main():
+            print("held: " + ", ".join(f"{run.config.tasks[n]} ({shares[n]:.2f})" for n in self._tasks.tolist()))
 
     def groups(self, wave: TensorDictBase) -> Tensor:
         """Bool [G]: the groups of a wave [G, N, T] whose task is held."""

@@ -149,23 +149,32 @@ class RunFolder:
             raise OSError(
                 f"{self.path} has {free_gb:.2f} GB free, a run needs {MIN_FREE_GB} GB: free some or change --run-dir"
             )
-        stored = self.path / "config.yaml"
-        if stored.exists():
-            before, now = stored_settings(stored, type(config)), settings_of(config)
-            changed = [key for key in now if before.get(key) != now[key] and key not in FREE]
-            if changed:
-                key, more = changed[0], f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
-                raise ValueError(
-                    f"{self.path} was made with {key}={before.get(key)!r}, now {now[key]!r}{more}: "
-                    "use another --run-dir, or the same settings to continue"
-                )
+        self.check_settings(config)
         for name in ("checkpoints", "rollouts", "plots", "stages"):
             (self.path / name).mkdir(exist_ok=True)
-        if begin is not None and self.is_new:
-            begin()
-        _write_atomically(stored, yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False))
+        if self.is_new:
+            for left in (self.path / "begun.json", *(self.path / "stages").iterdir()):
+                left.unlink(missing_ok=True)  # by a beginning that was interrupted: it may have had other settings
+            if begin is not None:
+                begin()
+        _write_atomically(
+            self.path / "config.yaml", yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False)
+        )
         self._note_versions()
         self._note_tasks(tasks or {})
+
+    def check_settings(self, config: Any) -> None:
+        """Raises ``ValueError`` if a run was made here with other settings, naming the first of them."""
+        if self.is_new:
+            return
+        before, now = stored_settings(self.path / "config.yaml", type(config)), settings_of(config)
+        changed = [key for key in now if before.get(key) != now[key] and key not in FREE]
+        if changed:
+            key, more = changed[0], f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
+            raise ValueError(
+                f"{self.path} was made with {key}={before.get(key)!r}, now {now[key]!r}{more}: "
+                "use another --run-dir, or the same settings to continue"
+            )
 
     def _note_tasks(self, tasks: dict[str, str]) -> None:
         """Notes the digests of the tasks in ``tasks.json``, once."""
@@ -198,6 +207,9 @@ class RunFolder:
             return
         shutil.rmtree(self.progress(stage), ignore_errors=True)
         (self.path / "stages" / stage).unlink(missing_ok=True)
+        begun = self.noted("begun")
+        if stage in begun.get("stages", ()):
+            self.note("begun", begun | {"stages": [name for name in begun["stages"] if name != stage]})
 
     def take_over(self, source: RunFolder, stages: Mapping[str, Iterable[str]]) -> None:
         """Copies what finished stages of another run have left, and what made them (``versions.json``); marks them

@@ -67,6 +67,9 @@ def plan(config: WorldEnvConfig) -> list[Stage]:
     if from_libero(config) and config.demonstrate.actions == "stored":
         return stages
     if config.post_train.env == "tabletop":  # the upper bound needs neither world model nor reflector
+        if config.post_train.hold:  # what is held is what exploration solved
+            see = {"policy": "sft", "target": "explore"}
+            stages.append(Stage("explore", "explore", "rollouts/explore.mcap", see))
         learn = {"source": "sft", "target": "post_train", "models": ""}
         judge = {"before": "sft", "after": "post_train", "models": None}
         stages.append(Stage("post_train", "post_train", "checkpoints/post_train", learn))
@@ -178,8 +181,12 @@ def check_made_of(stages: Sequence[Stage], parts: Parts, folder: RunFolder) -> N
             )
 
 
+def is_finished(stage: Stage, folder: RunFolder) -> bool:
+    return folder.done(stage.name) and (folder.path / stage.makes).exists()
+
+
 def _finished(stage: Stage, folder: RunFolder) -> bool:
-    return processes.agreed(folder.done(stage.name) and (folder.path / stage.makes).exists())
+    return processes.agreed(is_finished(stage, folder))
 
 
 def _warn(message: Warning | str) -> None:

@@ -107,7 +107,7 @@ def test_a_stage_reads_no_setting_that_could_change_unnoticed(whole):
         ({"adapt__steps": 0}, "reflector"),
         ({"post_train__hold": 0.0}, "adapted"),
         ({"post_train__draw": 1}, "adapted"),
-        ({"post_train__env": "tabletop"}, "sft"),
+        ({"post_train__env": "tabletop"}, "explore"),  # of what is held
         ({"evaluate__episodes_per_task": 3}, "post_train"),
         ({"rounds": 2}, "post_train"),
         ({"num_threads": 2, "checkpoint_minutes": 9.0}, "post_train"),
@@ -166,6 +166,17 @@ def test_an_unfinished_stage_does_not_come_over(whole, tmp_path):
     settings = dataclasses.replace(whole[0], run_dir=tmp_path / "new", begin_from=source)
     begun = beginning(settings, plan(settings), RunFolder(settings.run_dir))
     assert [stage.name for stage in begun.stages] == STAGES[:3] and "world_model is not finished there" in str(begun)
+
+
+def test_a_recording_that_is_cut_off_does_not_come_over(whole, tmp_path):
+    source = tmp_path / "source"
+    shutil.copytree(whole[0].run_dir, source)
+    recording = RunFolder(source).rollouts("explore")
+    recording.write_bytes(recording.read_bytes()[:-100])
+    settings = dataclasses.replace(whole[0], run_dir=tmp_path / "new", begin_from=source)
+    begun = beginning(settings, plan(settings), RunFolder(settings.run_dir))
+    assert [stage.name for stage in begun.stages] == STAGES[:2]
+    assert f"explore is cut off there: recipes/repair.py {recording} says" in str(begun)
 
 
 def test_a_task_that_has_changed_since_stays_there(whole, tmp_path):
@@ -241,13 +252,33 @@ def test_a_run_that_has_begun_goes_on_by_itself(whole, tmp_path):
     folder.forget("sft")
     open_run(settings).close()  # the same command: nothing is copied again
     open_run(dataclasses.replace(settings, begin_from=None)).close()
-    assert not folder.done("sft") and folder.noted("begun")["stages"] == STAGES[:-1]
+    own = [name for name in STAGES[:-1] if name != "sft"]
+    assert not folder.done("sft") and folder.noted("begun")["stages"] == own  # what is made here is not taken over
     other = tmp_path / "other"
     shutil.copytree(whole[0].run_dir, other)
     with pytest.raises(SystemExit, match=f"new holds a run that did not begin with {other}: use another --run-dir"):
         open_run(dataclasses.replace(settings, begin_from=other))
     with pytest.raises(SystemExit, match="begin_from is the run_dir itself"):
         open_run(dataclasses.replace(settings, begin_from=settings.run_dir))
+
+
+def test_once_it_has_begun_the_other_run_may_go(whole, tmp_path):
+    source = tmp_path / "source"
+    shutil.copytree(whole[0].run_dir, source)
+    settings = changed(whole[0], run_dir=tmp_path / "new", begin_from=source, post_train__draw=1)
+    open_run(settings).close()
+    shutil.rmtree(source)
+    open_run(settings).close()
+    assert RunFolder(settings.run_dir).done("adapted")
+
+
+def test_stages_of_a_beginning_that_was_killed_are_not_those_of_other_settings(whole, tmp_path):
+    settings = changed(whole[0], run_dir=tmp_path / "new", begin_from=whole[0].run_dir)
+    open_run(settings).close()
+    (settings.run_dir / "config.yaml").unlink()  # killed just before it is written
+    open_run(changed(settings, begin_from=None, seed=5)).close()
+    folder = RunFolder(settings.run_dir)
+    assert not any(folder.done(name) for name in STAGES) and folder.noted("begun") == {}
 
 
 def test_a_run_of_its_own_takes_nothing_over_later(whole, tiny):

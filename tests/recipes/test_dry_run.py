@@ -12,6 +12,7 @@ import dry_run as dry
 import world_env
 from parts import COMPACT, make_policy, make_reflector
 from rehearsal import rehearse
+from stages import open_run
 from worldenv_trl import keys
 
 
@@ -29,6 +30,21 @@ def test_a_preset_is_planned_in_its_order_and_no_folder_is_touched(tmp_path, cap
     assert not folder.exists() and "1 x H200 (989.0 TFLOP/s and 141.0 GB each) at 30%" in printed
     places = [printed.index(f"\n{name} ") for name in ("demonstrate", "sft", "explore", "post_train", "evaluate")]
     assert places == sorted(places)
+
+
+def test_of_a_run_that_has_begun_the_rest_is_planned_and_other_settings_are_refused(tiny, capsys):
+    folder = open_run(tiny).folder
+    for name, made in (("demonstrate", "rollouts/demonstrations.mcap"), ("sft", "checkpoints/sft")):
+        (folder.path / made).parent.mkdir(exist_ok=True)
+        (folder.path / made).touch()
+        (folder.path / "stages" / name).touch()
+    chosen = dry.options().parse_args(["--dry-run", "--gpu", "H100"])
+    assert dry.dry_run(tiny, chosen) == 0
+    printed = capsys.readouterr().out
+    assert f"demonstrate, sft: finished in {folder.path}" in printed
+    assert "\nexplore " in printed and "\nsft " not in printed
+    assert dry.dry_run(dataclasses.replace(tiny, seed=9), chosen) == 1
+    assert f"error: {folder.path} was made with seed=0, now 9" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,12 @@ from tensordict import TensorDict
 
 import holding
 from checks import check_config, check_loop
+from config import GOAL_TASKS
 from holding import Hold, solved_shares
 from physics import exploring_actor
 from post_train import post_train
 from run import Run
+from stages import plan
 from worldenv_trl import keys
 
 
@@ -30,10 +32,12 @@ def test_a_share_is_of_all_rollouts_of_a_task():
     assert shares == {0: 1.0, 2: pytest.approx(1 / 3), 5: 0.0}
 
 
-def test_what_cannot_be_held_is_refused_before_any_work():
+def test_what_cannot_be_held_is_refused_before_any_work_and_the_physics_asks_exploration_too():
     held = dataclasses.replace(SMALL, post_train=dataclasses.replace(SMALL.post_train, hold=1.0))
     with pytest.raises(ValueError, match=r"explore.scale_factors must hold 0, got 1$"):
         check_config(held)  # whose exploration has no greedy part
+    physics = dataclasses.replace(SMALL, post_train=dataclasses.replace(SMALL.post_train, hold=1.0, env="tabletop"))
+    assert [stage.name for stage in plan(physics)] == ["demonstrate", "sft", "explore", "post_train", "evaluate"]
     with pytest.raises(ValueError, match=r"post_train.hold is for policies with a mean, and Tokens acts by tokens"):
         check_loop(held, token_policy())
 
@@ -62,17 +66,21 @@ def test_a_task_that_is_held_stays_and_one_that_is_not_is_learned_as_without(phy
         held, logged = learned(physics, monkeypatch, 1.0, 0.85)
     assert all(torch.equal(value, source[name]) for name, value in held.items())
     assert [line["held_groups"] for line in logged if "return" in line] == [1.0, 1.0]
-    failed, logged = learned(physics, monkeypatch, 1.0, 0.8)
+    with pytest.warns(
+        UserWarning, match=r"no task is held: .* at most 0.80 of one, and --post-train.hold-from is 0.85"
+    ):
+        failed, logged = learned(physics, monkeypatch, 1.0, 0.8)
     free, _ = learned(physics, monkeypatch, 0.0, 1.0)
     assert any(not torch.equal(value, source[name]) for name, value in free.items())
     assert all(torch.equal(value, free[name]) for name, value in failed.items())
     assert [line["held_groups"] for line in logged if "return" in line] == [0.0, 0.0]
 
 
-def test_the_reference_is_what_the_source_does_at_held_decisions_alone(physics, monkeypatch):
-    monkeypatch.setattr(holding, "explored_at", lambda *_: episodes([4, 5], [0, 1]))
-    hold = Hold(physics, "sft", "")
-    wave = TensorDict({keys.TASK_ID: torch.tensor([4, 5]).view(2, 1, 1, 1).expand(2, 3, 4, 1)}, [2, 3, 4])
+def test_the_reference_is_what_the_source_does_at_held_decisions_alone(physics, monkeypatch, capsys):
+    monkeypatch.setattr(holding, "explored_at", lambda *_: episodes([0, 1], [0, 1]))
+    hold = Hold(dataclasses.replace(physics, config=dataclasses.replace(physics.config, tasks=GOAL_TASKS)), "sft", "")
+    assert capsys.readouterr().out == f"held: {GOAL_TASKS[1]} (1.00)\n"
+    wave = TensorDict({keys.TASK_ID: torch.tensor([0, 1]).view(2, 1, 1, 1).expand(2, 3, 4, 1)}, [2, 3, 4])
     assert hold.groups(wave).tolist() == [False, True]
     size = physics.config.image_size
     images = torch.randint(0, 255, (6, 3, size, size), dtype=torch.uint8)
