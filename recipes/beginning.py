@@ -129,5 +129,5 @@ def _of_the_run(settings: Mapping[str, Any]) -> set[str]:
 
 def _left_by(stage: Stage) -> list[str]:
     """Patterns of what a stage leaves, and the iterations of LOOP that were recorded."""
-    recorded = [f"rollouts/{stage.name}_[0-9][0-9][0-9]*.mcap"] if stage.kind == "post_train" else []
-    return [stage.makes, *recorded]
+    numbers = ("[0-9]" * digits for digits in (3, 4, 5)) if stage.kind == "post_train" else ()
+    return [stage.makes, *(f"rollouts/{stage.name}_{number}.mcap" for number in numbers)]

@@ -122,10 +122,15 @@ def recorded_actor(policy: Policy, settings: Mapping[str, Any]) -> LaplaceActor 
 def _checkpoint(part: Part[Kind], name: str | None, file: Path, metadata: dict, kind: str) -> Kind:
     """A checkpoint by name or folder; without one, that of the run with the recorded hash, else the newest."""
     folder = file.resolve().parent.parent / "checkpoints"
-    if name is not None and name != "recorded":
-        named = folder / name
-        return part.load(named if named.is_dir() else Path(name)).eval()
     found = [path for pattern in _NAMES[kind] for path in folder.glob(pattern) if path.is_dir()]
+    if name is not None and name != "recorded":
+        named = folder / name if (folder / name).is_dir() else Path(name)
+        if not named.is_dir():
+            there = ", ".join(sorted(path.name for path in found)) or "none"
+            raise FileNotFoundError(
+                f"{name} is no folder and no {kind.replace('_', ' ')} of {folder}: there is {there}"
+            )
+        return part.load(named).eval()
     if not found:
         option = kind.replace("_", "-")
         raise FileNotFoundError(f"no {kind.replace('_', ' ')} in {folder}: name a checkpoint with --{option}")

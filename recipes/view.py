@@ -82,6 +82,7 @@ def _foxglove(options: Options) -> int:
     target = options.save or options.file.with_name(f"{options.file.stem}.foxglove.json")
     if target.exists() and not options.overwrite and target.read_text() != layout:
         raise FileExistsError(f"{target} exists: pass --overwrite or --save another name")
+    target.parent.mkdir(parents=True, exist_ok=True)
     target.write_text(layout)
     program = shutil.which("foxglove-studio") or shutil.which("foxglove")
     if options.save is None and program is not None and has_display():

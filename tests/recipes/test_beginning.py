@@ -159,6 +159,16 @@ def test_the_versions_that_made_it_are_kept(whole, tmp_path):
     assert made == {"torch": "1.2.3"} and now["torch"] != "1.2.3"
 
 
+def test_what_a_user_keeps_beside_the_recordings_stays_there(whole, tmp_path):
+    source = tmp_path / "source"
+    shutil.copytree(whole[0].run_dir, source)
+    (source / "rollouts" / "post_train_000_rollout7_replay.mcap").touch()
+    settings = dataclasses.replace(whole[0], run_dir=tmp_path / "new", begin_from=source)
+    open_run(settings).close()
+    copied = {path.name for path in (settings.run_dir / "rollouts").iterdir()}
+    assert copied == {"demonstrations.mcap", "explore.mcap", "post_train_000.mcap", "post_train_001.mcap"}
+
+
 def test_an_unfinished_stage_does_not_come_over(whole, tmp_path):
     source = tmp_path / "source"
     shutil.copytree(whole[0].run_dir, source)

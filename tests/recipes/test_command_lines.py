@@ -100,7 +100,7 @@ REPLAY = [
     (("real.mcap", "--threshold", "0.5"), "--reflector"),
     (("real.mcap", "--threshold", "3"), "--threshold must be in (0, 1), got 3"),
     (("bare.mcap",), "bare.mcap holds no rollouts"),
-    (("real.mcap", "--policy", "gone"), "gone"),
+    (("real.mcap", "--policy", "gone"), "gone is no folder and no policy of "),
     (("real.mcap", "--world-model", "policy", "--mode", "imagination"), "holds OFTPolicy, not VideoWorldModel"),
     (("real.mcap", "--seed", "1"), "pass --policy"),
     (("real.mcap", "--target", "real.mcap"), "is the recording itself"),

@@ -143,7 +143,7 @@ def test_rollouts_are_saved_for_rerun_without_a_display(run, tmp_path, capsys, m
 
 def test_foxglove_gets_a_layout_of_the_recording(run, tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
-    target = tmp_path / "layout.json"
+    target = tmp_path / "new" / "layout.json"
     assert call(view_recipe, run / "rollouts" / "dream.mcap", "--viewer", "foxglove", "--save", target) == 0
     assert "Import from file" in capsys.readouterr().out
     assert "Plot!action" in json.loads(target.read_text())["configById"]
