@@ -5,7 +5,7 @@ what LOOP teaches it then is to see imagined frames, and not much about the task
 same actions from the same first frames, and the policy is distilled into itself: on both sorts of frames its means stay
 what they were on the real ones. It costs no rollout and reads no label.
 
-Alone: ``python recipes/adapt.py improve --adapt.steps 500 --run-dir runs/improve``.
+Alone: ``python recipes/adapt.py improve --adapt.steps 500 --begin-from runs/improve --run-dir runs/adapted``.
 """
 
 from __future__ import annotations

@@ -97,12 +97,14 @@ def stages_in_common(config: WorldEnvConfig, stages: Sequence[Stage], source: Ru
             return [], f"{task} has changed since it was made"
     different = [name for name in now if before.get(name) != now[name]]
     taken: list[Stage] = []
-    read = _of_the_run(now)
+    read, unread = _of_the_run(now), {"world_model.refit_steps"}
     for stage in (stage for stage in stages if stage.kind != "evaluate"):
         read |= set(DEPENDS_ON[stage.kind])
         if stage.kind == "sft" and config.parts == "real-size":
             read.add("post_train.lora_rank")  # of adapters that these parts are made with
-        changed = [name for name in different if name in read or name.split(".")[0] in read]
+        if stage.options.get("previous") is not None:
+            unread.clear()  # a later round's model is the first to be refitted
+        changed = [name for name in different if name not in unread and {name, name.split(".")[0]} & read]
         if changed:
             name = changed[0]
             return taken, f"{stage.name} is of {name}={before.get(name)!r} there and {now[name]!r} here"

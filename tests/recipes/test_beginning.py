@@ -110,6 +110,7 @@ def test_a_stage_reads_no_setting_that_could_change_unnoticed(whole):
         ({"post_train__env": "tabletop"}, "explore"),  # of what is held
         ({"evaluate__episodes_per_task": 3}, "post_train"),
         ({"rounds": 2}, "post_train"),
+        ({"rounds": 2, "world_model__refit_steps": 9}, "post_train"),
         ({"num_threads": 2, "checkpoint_minutes": 9.0}, "post_train"),
     ],
 )
