@@ -44,9 +44,9 @@ class Beginning:
     """No more than these."""
 
     def copy_to(self, folder: RunFolder) -> None:
-        folder.take_over(self.source, {stage.name: _left_by(stage) for stage in self.stages})
         names = [stage.name for stage in self.stages]
         folder.note("begun", {"run": str(self.source.path.resolve()), "stages": names})
+        folder.take_over(self.source, {stage.name: _left_by(stage) for stage in self.stages})
         print(self)
 
     def __str__(self) -> str:

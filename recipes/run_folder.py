@@ -153,8 +153,9 @@ class RunFolder:
         for name in ("checkpoints", "rollouts", "plots", "stages"):
             (self.path / name).mkdir(exist_ok=True)
         if self.is_new:
-            for left in (self.path / "begun.json", *(self.path / "stages").iterdir()):
-                left.unlink(missing_ok=True)  # by a beginning that was interrupted: it may have had other settings
+            if self.noted("begun"):  # a beginning was interrupted, and it may have had other settings
+                for left in (*(self.path / "stages").iterdir(), self.path / "begun.json"):
+                    left.unlink()
             if begin is not None:
                 begin()
         _write_atomically(
