@@ -27,7 +27,7 @@ STAGES = {
     "adapt": "adapted",
     "post_train": "post_train",
 }
-PHYSICS = {"post_train": {"env": "tabletop", "iterations": 2, "probe_every": 0}}
+PHYSICS = {"adapt": {"steps": 0}, "post_train": {"env": "tabletop", "iterations": 2, "probe_every": 0}}
 HOLDING = {"post_train": {"hold": 1.0, "iterations": 3, "probe_every": 0}}
 
 
