@@ -136,7 +136,7 @@ def replay(
         same = _same_model(source, "world_model", world_model, notes) and same
         same = _same_device(source, device_of(world_model).type, notes) and same
     if given is not None and reflector is not None:
-        same = _same_judge(source, given, reflector, notes) and same
+        same = _same_judge(source, given, reflector, mode, notes) and same
     if kind == "exact" and (source.imagined != (mode == "imagination") or not same):
         kind = "difference"
     shown = observed(played, first)
@@ -153,7 +153,7 @@ def replay(
         divergences.append(Divergence(min(end, before), "end", abs(end - before), words))
         divergences.sort(key=lambda each: each.step)
     elif end > before:
-        notes.append(f"without the reflector that stopped it the last chunk goes on to step {end}: pass it, too")
+        notes.append(f"without a reflector nothing stops it before its last chunk ends, at step {end}")
     report = ReplayReport(
         source=source.path,
         rollout=rollout,
@@ -321,11 +321,12 @@ def _same_model(source: Source, name: str, model: torch.nn.Module, notes: list[s
     return recorded == given
 
 
-def _same_judge(source: Source, given: Reflector, judging: Reflector, notes: list[str]) -> bool:
-    there = given.for_world("imagined" if source.imagined else "real")
-    if source.models.get("reflector") == model_hash(there) != model_hash(judging):
-        notes.append("the reflector's other part judges this world: its R is not the recorded one's")
-        return False
+def _same_judge(source: Source, given: Reflector, judging: Reflector, mode: str, notes: list[str]) -> bool:
+    if source.imagined != (mode == "imagination"):
+        there = given.for_world("imagined" if source.imagined else "real")
+        if source.models.get("reflector") == model_hash(there) != model_hash(judging):
+            notes.append("the reflector's other part judges this world: its R is not the recorded one's")
+            return False
     return _same_model(source, "reflector", judging, notes)
 
 
