@@ -224,10 +224,8 @@ def settings(record: RunRecord, evidence: Evidence | None) -> str:
 
 def _begun(record: RunRecord) -> str:
     """Of whose stages it began with."""
-    if not record.begun.get("stages"):
-        return ""
     names = ", ".join(escape(str(name)) for name in record.begun.get("stages", ()))
-    return f"<p>Taken over from {escape(str(record.begun.get('run')))}: {names}.</p>"
+    return f"<p>Taken over from {escape(str(record.begun.get('run')))}: {names}.</p>" if names else ""
 
 
 def _versions(record: RunRecord) -> str:

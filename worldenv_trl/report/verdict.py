@@ -30,9 +30,14 @@ def evaluation(record: RunRecord, protocol: str) -> dict[str, dict[str, Any]]:
     return {task: entry for task, entry in found.items() if {"before", "after"} <= set(entry)}
 
 
+def _probes(record: RunRecord) -> list[dict[str, Any]]:
+    """Those of post-training that the honesty alarm has seen."""
+    return [x for x in record.lines if x["stage"].startswith("post_train") and "honesty_alarm" in x]
+
+
 def alarms(record: RunRecord) -> list[dict[str, Any]]:
     """The probes of post-training at which the honesty alarm fired."""
-    return [x for x in record.lines if x["stage"].startswith("post_train") and x.get("honesty_alarm")]
+    return [x for x in _probes(record) if x["honesty_alarm"]]
 
 
 def headline(record: RunRecord, evidence: Evidence | None) -> str:
@@ -108,8 +113,7 @@ def _model_tiles(record: RunRecord, evidence: Evidence | None) -> list[tuple[str
         note = f"of the stops on {row['n']} held-out episodes; {found}"
         value = f"{rate(row['precision'])} %" if row["imagined"] else "–"
         tiles.append(("Imagined successes that are real", value, note))
-    fired = alarms(record)
-    probes = [x for x in record.lines if x["stage"].startswith("post_train") and "honesty_alarm" in x]
+    probes, fired = _probes(record), alarms(record)
     if fired:
         tiles.append(("Honesty alarm", '<span class="bad">fired</span>', f"at iteration {fired[0]['step']}"))
     elif len(probes) == 1:
