@@ -108,9 +108,9 @@ def stages_in_common(config: WorldEnvConfig, stages: Sequence[Stage], source: Ru
         if changed:
             name = changed[0]
             return taken, f"{stage.name} is of {name}={before.get(name)!r} there and {now[name]!r} here"
-        made = source.path / stage.makes
-        if not source.done(stage.name) or not made.exists():
+        if not stage.finished_in(source):
             return taken, f"{stage.name} is not finished there"
+        made = source.path / stage.makes
         if made.suffix == ".mcap" and _is_cut_off(made):
             return taken, f"{stage.name} is cut off there: recipes/repair.py {made} says what is left"
         taken.append(stage)

@@ -24,7 +24,7 @@ from real_parts import parts_of
 from rehearsal import Rehearsal, rehearse
 from run_folder import RunFolder
 from stage_plan import Machine, StagePlan, decisions, iteration_flops, moved_bytes, stage_plans, wave_bytes
-from stages import is_finished, plan
+from stages import plan
 
 _HERE = "here"
 _TITLES = {"policy": "policy", "world_model": "world model", "reflector": "reflector"}
@@ -76,7 +76,7 @@ def dry_run(config: WorldEnvConfig, chosen: argparse.Namespace, parts: Parts | N
     found = rehearse(config, parts, published)
     for name in published:
         print(f"{_TITLES[name]}: no folder named (--real-size.{name.replace('_', '-')}), of published sizes")
-    finished = [stage.name for stage in plan(config) if is_finished(stage, folder)]
+    finished = [stage.name for stage in plan(config) if stage.finished_in(folder)]
     here = [f"{', '.join(finished)}: finished in {folder.path}"] if finished else []
     for line in (*told(config), *found.shapes, *([str(begun)] if begun else here)):
         print(line)

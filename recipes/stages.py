@@ -55,6 +55,9 @@ class Stage:
     """What it leaves in the run folder; without it the stage counts as not finished."""
     options: Mapping[str, Any] = field(default_factory=dict)
 
+    def finished_in(self, folder: RunFolder) -> bool:
+        return folder.done(self.name) and (folder.path / self.makes).exists()
+
 
 def plan(config: WorldEnvConfig) -> list[Stage]:
     """World-Env's Algorithm 1 as a list; a later round continues from the policy that the round before reached.
@@ -181,12 +184,8 @@ def check_made_of(stages: Sequence[Stage], parts: Parts, folder: RunFolder) -> N
             )
 
 
-def is_finished(stage: Stage, folder: RunFolder) -> bool:
-    return folder.done(stage.name) and (folder.path / stage.makes).exists()
-
-
 def _finished(stage: Stage, folder: RunFolder) -> bool:
-    return processes.agreed(is_finished(stage, folder))
+    return processes.agreed(stage.finished_in(folder))
 
 
 def _warn(message: Warning | str) -> None:
