@@ -7,6 +7,7 @@ one pair of models, and no folder mixes settings. ``begun.json`` says what came 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,13 @@ DEPENDS_ON: dict[str, tuple[str, ...]] = {
 }
 """Settings, or sections of them, that a kind of stage depends on besides those of the stages before it and those of the
 whole run: its tasks, seed, cameras and so on."""
+_SWITCHES = {
+    "adapt": "adapt.steps",
+    "explore.replay_shift_m": "explore.replay_share",
+    "post_train.hold_from": "post_train.hold",
+    "post_train.probe_contexts": "post_train.probe_every",
+}
+"""Settings, or sections of them, that are not read while another one is 0; that one always counts."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +54,11 @@ class Beginning:
     def copy_to(self, folder: RunFolder) -> None:
         names = [stage.name for stage in self.stages]
         folder.note("begun", {"run": str(self.source.path.resolve()), "stages": names})
-        folder.take_over(self.source, {stage.name: _left_by(stage) for stage in self.stages})
+        try:
+            folder.take_over(self.source, {stage.name: _left_by(stage) for stage in self.stages})
+        except KeyboardInterrupt:
+            print(f"not all of {self.source.path} has come over: the same command begins again", file=sys.stderr)
+            raise
         print(self)
 
     def __str__(self) -> str:
@@ -97,13 +109,13 @@ def stages_in_common(config: WorldEnvConfig, stages: Sequence[Stage], source: Ru
             return [], f"{task} has changed since it was made"
     different = [name for name in now if before.get(name) != now[name]]
     taken: list[Stage] = []
-    read, unread = _of_the_run(now), {"world_model.refit_steps"}
+    read, unread = _of_the_run(now), _switched_off(now) | {"world_model.refit_steps"}
     for stage in (stage for stage in stages if stage.kind != "evaluate"):
         read |= set(DEPENDS_ON[stage.kind])
         if stage.kind == "sft" and config.parts == "real-size":
             read.add("post_train.lora_rank")  # of adapters that these parts are made with
         if stage.options.get("previous") is not None:
-            unread.clear()  # a later round's model is the first to be refitted
+            unread.discard("world_model.refit_steps")  # a later round's model is the first to be refitted
         changed = [name for name in different if name not in unread and {name, name.split(".")[0]} & read]
         if changed:
             name = changed[0]
@@ -127,6 +139,12 @@ def _of_the_run(settings: Mapping[str, Any]) -> set[str]:
     """Settings that every stage depends on: those of no stage."""
     of_stages = {name.split(".")[0] for names in DEPENDS_ON.values() for name in names} | {"evaluate"}
     return {name for name in settings if "." not in name and name not in of_stages | _ANYWHERE}
+
+
+def _switched_off(settings: Mapping[str, Any]) -> set[str]:
+    """Settings without effect where others are what they are."""
+    by = {name: _SWITCHES.get(name, _SWITCHES.get(name.split(".")[0], name)) for name in settings}
+    return {name for name, switch in by.items() if switch != name and not settings[switch]}
 
 
 def _left_by(stage: Stage) -> list[str]:

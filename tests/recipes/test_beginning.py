@@ -8,6 +8,7 @@ import shutil
 import sys
 
 import pytest
+import yaml
 from small_run import SMALL
 
 import config
@@ -105,6 +106,10 @@ def test_a_stage_reads_no_setting_that_could_change_unnoticed(whole):
         ({"post_train__lora_rank": 8}, "reflector"),
         ({"post_train__scale_factor": 0.5}, "reflector"),
         ({"adapt__steps": 0}, "reflector"),
+        ({"adapt__lr": 1e-5}, "reflector"),
+        ({"explore__replay_shift_m": 0.02}, "sft"),
+        ({"post_train__hold_from": 0.5}, "adapted"),
+        ({"post_train__probe_contexts": 3}, "adapted"),
         ({"post_train__hold": 0.0}, "adapted"),
         ({"post_train__draw": 1}, "adapted"),
         ({"post_train__env": "tabletop"}, "explore"),  # of what is held
@@ -119,6 +124,29 @@ def test_what_comes_over_ends_where_a_setting_differs(whole, tmp_path, change, l
     begun = beginning(settings, plan(settings), RunFolder(settings.run_dir))
     assert [stage.name for stage in begun.stages] == STAGES[: STAGES.index(last) + 1]
     assert not settings.run_dir.exists()
+
+
+@pytest.mark.parametrize(
+    ("off", "change"),
+    [
+        ("adapt.steps", {"adapt__lr": 1e-5, "adapt__batch_size": 3}),
+        ("explore.replay_share", {"explore__replay_shift_m": 0.02}),
+        ("post_train.hold", {"post_train__hold_from": 0.5}),
+        ("post_train.probe_every", {"post_train__probe_contexts": 3}),
+    ],
+)
+def test_a_setting_that_another_one_has_switched_off_keeps_nothing_back(whole, tmp_path, off, change):
+    section, name = off.split(".")
+    settings = changed(whole[0], run_dir=tmp_path / "source", **{f"{section}__{name}": 0})
+    shutil.copytree(whole[0].run_dir, settings.run_dir)
+    stored = yaml.safe_load((settings.run_dir / "config.yaml").read_text())
+    stored[section][name] = 0
+    (settings.run_dir / "config.yaml").write_text(yaml.safe_dump(stored))
+    other = changed(settings, run_dir=tmp_path / "new", begin_from=settings.run_dir, **change)
+    begun = beginning(other, plan(other), RunFolder(other.run_dir))
+    assert [stage.name for stage in begun.stages] == [stage.name for stage in plan(settings)[:-1]]
+    on = changed(other, **{f"{section}__{name}": 1})
+    assert len(beginning(on, plan(on), RunFolder(on.run_dir)).stages) < len(begun.stages)
 
 
 @pytest.mark.parametrize(
@@ -231,7 +259,7 @@ def test_another_draw_is_other_random_numbers_for_loop_alone(whole, tmp_path):
     assert found[0] == found[1] == weights(whole[0], "post_train") and found[2] != found[0]
 
 
-def test_interrupted_while_it_copies_it_begins_again(whole, tmp_path, monkeypatch):
+def test_interrupted_while_it_copies_it_begins_again(whole, tmp_path, monkeypatch, capsys):
     settings = dataclasses.replace(
         changed(whole[0], post_train__draw=1), run_dir=tmp_path / "new", begin_from=whole[0].run_dir
     )
@@ -246,6 +274,7 @@ def test_interrupted_while_it_copies_it_begins_again(whole, tmp_path, monkeypatc
     monkeypatch.setattr(shutil, "copytree", interrupted)
     with pytest.raises(SystemExit):
         open_run(settings)
+    assert f"not all of {whole[0].run_dir} has come over: the same command begins again" in capsys.readouterr().err
     assert RunFolder(settings.run_dir).is_new
     monkeypatch.setattr(shutil, "copytree", copy)
     open_run(settings).close()

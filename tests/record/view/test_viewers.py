@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -269,3 +270,14 @@ def test_without_rerun_the_error_says_what_to_install(steps, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "rerun", None)
     with pytest.raises(ImportError, match=r"pip install 'worldenv_trl\[viz\]'"):
         rerun_recording(steps)
+
+
+def test_the_layout_of_a_recording_that_was_cut_off_says_so(steps, tmp_path):
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(steps.read_bytes()[:-200])
+    with pytest.warns(UserWarning, match=f"{path} .*: Foxglove may show less of it"):
+        layout = foxglove_layout(path)
+    assert "/step.reward" in values_in(layout)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        foxglove_layout(steps)

@@ -6,6 +6,7 @@ import copy
 import json
 import os
 import re
+import warnings
 from importlib.resources import files
 from typing import Any
 
@@ -24,6 +25,7 @@ def foxglove_layout(path: str | os.PathLike | None = None) -> dict[str, Any]:
 
     Panels and plotted values of topics and fields that the recording lacks are left out, so that none shows an error;
     cameras that the layout does not know get a panel, too. A replay's camera says what it is a replay of.
+    A warning says of a file that it was cut off or damaged: Foxglove may show less than :func:`read_rollouts` reads.
 
     Raises:
         FileNotFoundError, ValueError: as :func:`~worldenv_trl.record.read_rollouts`.
@@ -32,6 +34,11 @@ def foxglove_layout(path: str | os.PathLike | None = None) -> dict[str, Any]:
     if path is None:
         return layout
     recording = Recording(_require_file(path))
+    if not recording.scan.intact:
+        warnings.warn(
+            f"{path} {recording.scan.losses[0]}: Foxglove may show less of it than recipes/repair.py rescues",
+            stacklevel=2,
+        )
     have = _paths(recording)
     panels = layout["configById"]
     shown = {panel["imageMode"]["imageTopic"] for name, panel in panels.items() if name.startswith("Image!")}
