@@ -39,10 +39,12 @@ class Hold:
         self._tasks = torch.tensor(
             [task for task, share in shares.items() if share >= run.config.post_train.hold_from], dtype=torch.long
         )
-        if len(self._tasks) == len(run.config.tasks):
+        self._count = len(run.config.tasks)
+        if self.everything:
             warnings.warn(
-                f"all tasks are held, so nothing is learned: greedy exploration solved at least "
-                f"{min(shares.values()):.2f} of each; pass --post-train.hold 0, or a higher --post-train.hold-from",
+                f"all tasks are held, so LOOP is left out: greedy exploration solved at least "
+                f"{min(shares.values()):.2f} of each; a new run with --begin-from {run.folder.path} and "
+                "--post-train.hold 0, or with a higher --post-train.hold-from, learns",
                 stacklevel=2,
             )
         elif not len(self._tasks):
@@ -53,6 +55,11 @@ class Hold:
             )
         elif processes.is_main():
             print("held: " + ", ".join(f"{run.config.tasks[n]} ({shares[n]:.2f})" for n in self._tasks.tolist()))
+
+    @property
+    def everything(self) -> bool:
+        """Whether all tasks are held: there is nothing to learn."""
+        return len(self._tasks) == self._count
 
     def groups(self, wave: TensorDictBase) -> Tensor:
         """Bool [G]: the groups of a wave [G, N, T] whose task is held."""

@@ -48,7 +48,8 @@ def post_train(
     returns_of: Callable[[TensorDictBase], torch.Tensor] = collected_returns,
     watch: Callable[[int, Policy], None] | None = None,
 ) -> None:
-    """Improves checkpoint ``source`` in the world model and reflector of round ``models``; writes ``target``.
+    """Improves checkpoint ``source`` in the world model and reflector of round ``models``; writes ``target``, where
+    every task is held a copy.
 
     Keyword Args:
         returns_of: from a wave ``[G, N, T]`` to the returns ``[G, N]`` that are learned from.
@@ -59,6 +60,12 @@ def post_train(
     hold = Hold(run, source, models) if settings.hold else None
     run.seed_everything(target, another_draw(settings.draw))
     policy = run.policy(source)
+    if hold is not None and hold.everything:
+        if watch is not None:
+            processes.on_main(lambda: watch(0, policy))
+        if processes.is_main():
+            policy.save_pretrained(run.folder.checkpoint(target))
+        return
     groups = policy.post_training_parameters(settings.lora_rank)
     rates = {name: settings.head_lr if name == "heads" else settings.lora_lr for name in groups}
     for name in [name for name, rate in rates.items() if not rate]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 
 import pytest
 import torch
@@ -60,10 +61,21 @@ def learned(run, monkeypatch, weight, solved):
     return run.policy(name).state_dict(), run.folder.read_metrics(name)
 
 
+def test_where_all_tasks_are_held_loop_is_left_out(physics, monkeypatch):
+    again = rf"LOOP is left out: .* at least 0.85 of each; a new run with --begin-from {physics.folder.path} and"
+    with pytest.warns(UserWarning, match=again):
+        held, logged = learned(physics, monkeypatch, 1.0, 0.85)
+    source = physics.policy("sft").state_dict()
+    assert all(torch.equal(value, source[name]) for name, value in held.items())
+    assert not any("return" in line for line in logged)
+
+
 def test_a_task_that_is_held_stays_and_one_that_is_not_is_learned_as_without(physics, monkeypatch):
     source = physics.policy("sft").state_dict()
-    with pytest.warns(UserWarning, match=r"all tasks are held.* at least 0.85 of each"):
-        held, logged = learned(physics, monkeypatch, 1.0, 0.85)
+    with monkeypatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        patch.setattr(Hold, "everything", False)  # as where another task is not held: LOOP goes on
+        held, logged = learned(physics, patch, 1.0, 0.85)
     assert all(torch.equal(value, source[name]) for name, value in held.items())
     assert [line["held_groups"] for line in logged if "return" in line] == [1.0, 1.0]
     with pytest.warns(

@@ -66,7 +66,8 @@ def _losses(lines: list[dict[str, Any]]) -> Any:
 def _success_per_iteration(lines: list[dict[str, Any]]) -> Any:
     from matplotlib.figure import Figure
 
-    stages = [stage for stage in dict.fromkeys(line["stage"] for line in lines) if stage.startswith("post_train")]
+    learned = (line["stage"] for line in lines if "return" in line)
+    stages = [stage for stage in dict.fromkeys(learned) if stage.startswith("post_train")]
     if not stages:
         return None
     figure = Figure(figsize=(6.4 * len(stages), 3.2))

@@ -63,7 +63,9 @@ def learning(record: RunRecord) -> str:
         "Bands are 95 % intervals."
     )
     if not parts:
-        parts = [missing("Missing: the stage post_train has not logged an iteration yet.")]
+        parts = [
+            missing("Missing: the stage post_train has logged no iteration, not yet or because all tasks are held.")
+        ]
     losses = [
         card(f"{stage}: {name}", [], line_chart(
             [Series(name, "plain", *record.series(stage, key))], label=f"{stage}, {name}", x_label="step", y_label="",
