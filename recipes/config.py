@@ -152,7 +152,8 @@ class Reflector:
 
 @dataclass(frozen=True)
 class Adapt:
-    """Before LOOP the policy learns to do on imagined frames what it does on the real ones (``adapt.py``)."""
+    """Before LOOP in imagination the policy learns to do on imagined frames what it does on the real ones
+    (``adapt.py``); in the physics there is nothing to adapt to."""
 
     steps: int = 0
     """0 leaves the stage out."""
@@ -160,7 +161,7 @@ class Adapt:
     """Explored episodes of each task that are imagined for it, as many as there are at most."""
     batch_size: int = 48
     """Decisions, each seen both ways."""
-    lr: float = 3e-4
+    lr: float = 1e-4
 
 
 @dataclass(frozen=True)
@@ -190,9 +191,6 @@ class PostTrain:
     chance."""
     averaging: float = 0.8
     """Decay per iteration of the running mean of the weights that is saved."""
-    source_share: float = 0.0
-    """Share in what is saved of the weights that LOOP began with; the running mean has the rest. After imagination a
-    half gives back most of what LOOP breaks, if the policy solved nine in ten before; 0 is better if it solved less."""
     hold: float = 0.0
     """Weight of a pull of the policy's mean to where it was before LOOP, in units of its scale, on rollouts of tasks it
     solves; their returns are not learned from. At 0 nothing is held."""
@@ -341,7 +339,8 @@ _IMPROVE = WorldEnvConfig(
     ),
     explore=Explore(episodes_per_task=480),
     reflector=Reflector(choose_threshold=True, path_steps=800),
-    post_train=PostTrain(iterations=36, lora_rank=0, lora_lr=5e-5, head_lr=5e-5, source_share=0.5),
+    adapt=Adapt(steps=500),
+    post_train=PostTrain(iterations=36, lora_rank=0, lora_lr=1e-4, head_lr=1e-4, hold=1.0),
 )
 
 

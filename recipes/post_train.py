@@ -99,9 +99,8 @@ def post_train(
         weight_decay=0.0,
     )
     full_rates = [group["lr"] for group in optimizer.param_groups]
-    # Single iterations are noisy, and LOOP breaks what its contexts do not show: what is probed and saved is a running
-    # mean of the weights, with a share of those it began with.
-    mean = RunningMean(policy, settings.averaging, settings.source_share)
+    # Single iterations are noisy: what is probed and saved is a running mean of the weights.
+    mean = RunningMean(policy, settings.averaging)
     averaged = mean.policy
     mean_actor = policy_actor(averaged)
 

@@ -3,7 +3,7 @@
 ``python recipes/benchmarks/learning.py improve --source runs/improve --run-dir runs/curve_0 --num-threads 1``: a preset
 and settings as for ``recipes/world_env.py``; ``post-train.iterations`` times ``groups`` times ``group-size`` rollouts.
 Greedy and sampled success on training and on validation states is written point by point; a curve that was interrupted
-begins again. ``recipes/benchmarks/learning_plot.py runs/curve_*`` draws several.
+begins again. Nothing is held: all tasks learn. ``recipes/benchmarks/learning_plot.py runs/curve_*`` draws several.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class Measured:
 
 
 def main(settings: Learning) -> None:
-    learned = dataclasses.replace(settings.config.post_train, env="tabletop", probe_every=0)
+    learned = dataclasses.replace(settings.config.post_train, env="tabletop", probe_every=0, hold=0.0)
     config = dataclasses.replace(settings.config, post_train=learned)
     with refusals():
         check_corruption(settings.corruption, len(config.tasks))

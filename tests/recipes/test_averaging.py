@@ -1,4 +1,4 @@
-"""The running mean of a policy's weights against its formula and torch's, its share of the source, and its bytes."""
+"""The running mean of a policy's weights against torch's, and its bytes."""
 
 from __future__ import annotations
 
@@ -59,33 +59,16 @@ def test_only_what_learns_is_held_twice():
     assert all(torch.equal(before[name], value) for name, value in policy.state_dict().items())
 
 
-@pytest.mark.parametrize("share", [0.25, 1.0])
-def test_a_share_of_the_source_lies_between_it_and_the_mean(share):
-    policy, parameters = learner(4)
-    source = {name: value.clone() for name, value in policy.state_dict().items()}
-    mean, drawn_back = RunningMean(policy, 0.8), RunningMean(policy, 0.8, share)
-    for step in range(3):
-        stepped(parameters, step)
-        mean.update()
-        drawn_back.update()
-        reached, found = mean.policy.state_dict(), drawn_back.policy.state_dict()
-        for name, value in found.items():
-            torch.testing.assert_close(value, share * source[name] + (1 - share) * reached[name])
-    assert any(not torch.equal(reached[name], value) for name, value in source.items())
-    assert any(not torch.equal(found[name], value) for name, value in policy.state_dict().items())
-
-
-def test_before_an_update_the_source_is_all_there_is():
+def test_before_an_update_it_is_the_policy():
     policy, _ = learner(4)
-    found = RunningMean(policy, 0.8, 0.5).policy.state_dict()
+    found = RunningMean(policy, 0.8).policy.state_dict()
     assert all(torch.equal(found[name], value) for name, value in policy.state_dict().items())
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5])
-def test_it_continues_from_its_state(share):
+def test_it_continues_from_its_state():
     (policy, parameters), (again, others) = learner(4), learner(4)
-    first = RunningMean(policy, 0.5, share)
-    second = RunningMean(again, 0.5, share)
+    first = RunningMean(policy, 0.5)
+    second = RunningMean(again, 0.5)
     for step in range(2):
         stepped(parameters, step)
         first.update()

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 import holding
 from checks import check_config, check_loop
-from config import GOAL_TASKS
+from config import GOAL_TASKS, Adapt
 from holding import Hold, solved_shares
 from physics import exploring_actor
 from post_train import post_train
@@ -37,7 +37,8 @@ def test_what_cannot_be_held_is_refused_before_any_work_and_the_physics_asks_exp
     held = dataclasses.replace(SMALL, post_train=dataclasses.replace(SMALL.post_train, hold=1.0))
     with pytest.raises(ValueError, match=r"explore.scale_factors must hold 0, got 1$"):
         check_config(held)  # whose exploration has no greedy part
-    physics = dataclasses.replace(SMALL, post_train=dataclasses.replace(SMALL.post_train, hold=1.0, env="tabletop"))
+    learned = dataclasses.replace(SMALL.post_train, hold=1.0, env="tabletop")
+    physics = dataclasses.replace(SMALL, post_train=learned, adapt=Adapt(steps=2))  # of imagination alone
     assert [stage.name for stage in plan(physics)] == ["demonstrate", "sft", "explore", "post_train", "evaluate"]
     with pytest.raises(ValueError, match=r"post_train.hold is for policies with a mean, and Tokens acts by tokens"):
         check_loop(held, token_policy())

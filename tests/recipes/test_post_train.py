@@ -68,12 +68,12 @@ def test_contexts_come_in_shuffled_passes(physics):
     assert sorted(drawn[0] + drawn[1]) == sorted(drawn[2] + drawn[3]) == [0, 1, 2, 3]
 
 
-def saved(run, share, returns_of):
-    """Weights that LOOP saves of the whole policy, this share its source's, and those that ``watch`` saw at the end."""
-    settings = dataclasses.replace(run.config.post_train, source_share=share, lora_rank=0)
+def saved(run, decay, returns_of):
+    """Weights that LOOP saves of the whole policy, and those that ``watch`` saw at first and after each iteration."""
+    settings = dataclasses.replace(run.config.post_train, averaging=decay, lora_rank=0)
     run = dataclasses.replace(run, config=dataclasses.replace(run.config, post_train=settings))
     seen = []
-    name = f"drawn_back_{share}"
+    name = f"mean_{decay}"
     post_train(
         run,
         "sft",
@@ -82,10 +82,10 @@ def saved(run, share, returns_of):
         returns_of=returns_of,
         watch=lambda _, policy: seen.append({key: value.clone() for key, value in policy.state_dict().items()}),
     )
-    return run.policy(name).state_dict(), seen[-1]
+    return run.policy(name).state_dict(), seen
 
 
-def test_loop_saves_and_shows_what_lies_between_its_source_and_what_it_learned(physics, monkeypatch):
+def test_loop_saves_and_shows_the_running_mean_of_what_it_learned(physics, monkeypatch):
     # One name for both runs would delete the first one's weights; other names alone draw other numbers.
     monkeypatch.setattr(Run, "seed", lambda *_: 1)
 
@@ -93,11 +93,15 @@ def test_loop_saves_and_shows_what_lies_between_its_source_and_what_it_learned(p
         return wave[keys.CHUNK][..., :3].mean((-1, -2, -3))
 
     source = physics.policy("sft").state_dict()
-    (whole, _), (half, shown) = (saved(physics, share, returns_of) for share in (0.0, 0.5))
-    for name, value in half.items():
-        torch.testing.assert_close(value, (source[name] + whole[name]) / 2)
-        torch.testing.assert_close(value, shown[name])
-    assert any((whole[name] - value).abs().max() > 1e-4 for name, value in source.items())
+    (last, reached), (mean, shown) = (saved(physics, decay, returns_of) for decay in (0.0, 0.8))
+    for name, value in mean.items():
+        expected = reached[1][name]
+        for later in reached[2:]:
+            expected = torch.lerp(later[name], expected, 0.8) if value.is_floating_point() else later[name]
+        torch.testing.assert_close(value, expected)
+        assert torch.equal(value, shown[-1][name]) and torch.equal(last[name], reached[-1][name])
+        assert torch.equal(reached[0][name], source[name])
+    assert any((mean[name] - value).abs().max() > 1e-4 for name, value in last.items())
 
 
 def test_iterations_that_stop_after_their_first_update_are_counted_and_said():

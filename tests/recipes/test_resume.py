@@ -39,7 +39,6 @@ SETTINGS = dataclasses.replace(
         epochs=1,
         probe_every=1,
         probe_contexts=2,
-        source_share=0.5,
     ),
 )
 
