@@ -19,6 +19,7 @@ from torch import Tensor
 import processes
 from data_parallel import DataParallel, WholeOptimizer
 from episodes import explored_at, round_of
+from holding import all_held
 from imagining import imagined
 from physics import exploring_actor
 from resumable import Resumable
@@ -34,13 +35,18 @@ from worldenv_trl.row_texts import row_texts
 
 
 def adapt(run: Run, source: str = "sft", target: str = "adapted", models: str = "") -> None:
-    """Imagines explored episodes of a round in its world model; writes ``checkpoints/<target>``.
+    """Imagines explored episodes of a round in its world model; writes ``checkpoints/<target>``, where LOOP holds every
+    task a copy of ``source``.
 
     All groups of parameters move that LOOP's rank gives (``Policy.post_training_parameters``).
     """
     config, settings = run.config, run.config.adapt
     run.seed_everything(target)
     policy = run.policy(source).eval()
+    if all_held(run, models):  # LOOP is left out
+        if processes.is_main():
+            policy.save_pretrained(run.folder.checkpoint(target))
+        return
     explored = sampled_as_in_loop(run, round_of(models))
     with run.folder.lasting_scratch() as scratch:
         dreamt = imagined(run, run.world_model(models), explored, target, "explored", scratch)

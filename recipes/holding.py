@@ -30,16 +30,16 @@ class Hold:
     Args:
         source: that policy's checkpoint, a copy of which is kept.
         models: suffix of the round, whose exploration is asked.
+
+    Attributes:
+        everything: whether all tasks are held, so that there is nothing to learn.
     """
 
     def __init__(self, run: Run, source: str, models: str) -> None:
         policy = run.policy(source).eval()
         self._actor = exploring_actor(run.config, policy, run.config.post_train.scale_factor)
-        shares = solved_shares(explored_at(run, round_of(models), [0.0]))
-        self._tasks = torch.tensor(
-            [task for task, share in shares.items() if share >= run.config.post_train.hold_from], dtype=torch.long
-        )
-        self._count = len(run.config.tasks)
+        shares, held = _solved(run, models)
+        self._tasks, self.everything = torch.tensor(held, dtype=torch.long), len(held) == len(run.config.tasks)
         if self.everything:
             warnings.warn(
                 f"all tasks are held, so LOOP is left out: greedy exploration solved at least "
@@ -47,19 +47,14 @@ class Hold:
                 "--post-train.hold 0, or with a higher --post-train.hold-from, learns",
                 stacklevel=2,
             )
-        elif not len(self._tasks):
+        elif not held:
             warnings.warn(
                 f"no task is held: greedy exploration solved at most {max(shares.values()):.2f} of one, and "
                 f"--post-train.hold-from is {run.config.post_train.hold_from:g}",
                 stacklevel=2,
             )
         elif processes.is_main():
-            print("held: " + ", ".join(f"{run.config.tasks[n]} ({shares[n]:.2f})" for n in self._tasks.tolist()))
-
-    @property
-    def everything(self) -> bool:
-        """Whether all tasks are held: there is nothing to learn."""
-        return len(self._tasks) == self._count
+            print("held: " + ", ".join(f"{run.config.tasks[n]} ({shares[n]:.2f})" for n in held))
 
     def groups(self, wave: TensorDictBase) -> Tensor:
         """Bool [G]: the groups of a wave [G, N, T] whose task is held."""
@@ -76,6 +71,17 @@ class Hold:
             found: Any = self._actor.get_dist(decisions[rows].select(*self._actor.policy.in_keys))
             loc[rows], scale[rows] = found.loc, found.scale
         decisions[keys.REFERENCE_LOC], decisions[keys.REFERENCE_SCALE] = loc, scale
+
+
+def all_held(run: Run, models: str) -> bool:
+    """Whether LOOP holds every task of a round, so that there is nothing to learn and the policy stays as it is."""
+    return bool(run.config.post_train.hold) and len(_solved(run, models)[1]) == len(run.config.tasks)
+
+
+def _solved(run: Run, models: str) -> tuple[dict[int, float], list[int]]:
+    """What greedy exploration solved of each task, and the tasks of which that is enough to hold them."""
+    shares = solved_shares(explored_at(run, round_of(models), [0.0]))
+    return shares, [task for task, share in shares.items() if share >= run.config.post_train.hold_from]
 
 
 def solved_shares(episodes: Episodes) -> dict[int, float]:

@@ -108,9 +108,9 @@ def test_a_stage_reads_no_setting_that_could_change_unnoticed(whole):
         ({"adapt__steps": 0}, "reflector"),
         ({"adapt__lr": 1e-5}, "reflector"),
         ({"explore__replay_shift_m": 0.02}, "sft"),
-        ({"post_train__hold_from": 0.5}, "adapted"),
+        ({"post_train__hold_from": 0.5}, "reflector"),
         ({"post_train__probe_contexts": 3}, "adapted"),
-        ({"post_train__hold": 0.0}, "adapted"),
+        ({"post_train__hold": 0.0}, "reflector"),
         ({"post_train__draw": 1}, "adapted"),
         ({"post_train__env": "tabletop"}, "explore"),  # of what is held
         ({"evaluate__episodes_per_task": 3}, "post_train"),

@@ -11,6 +11,7 @@ from small_run import SMALL, token_policy, with_untrained_policy
 from tensordict import TensorDict
 
 import holding
+from adapt import adapt
 from checks import check_config, check_loop
 from config import GOAL_TASKS, Adapt
 from holding import Hold, solved_shares
@@ -62,6 +63,14 @@ def learned(run, monkeypatch, weight, solved):
     return run.policy(name).state_dict(), run.folder.read_metrics(name)
 
 
+def test_where_all_tasks_are_held_nothing_is_adapted(physics, monkeypatch):
+    monkeypatch.setattr(holding, "explored_at", lambda *_: episodes([0, 0], [1, 1]))
+    settings = dataclasses.replace(physics.config.post_train, hold=1.0)
+    adapt(dataclasses.replace(physics, config=dataclasses.replace(physics.config, post_train=settings)))
+    source, kept = physics.policy("sft").state_dict(), physics.policy("adapted").state_dict()
+    assert all(torch.equal(value, source[name]) for name, value in kept.items())
+
+
 def test_where_all_tasks_are_held_loop_is_left_out(physics, monkeypatch):
     again = rf"LOOP is left out: .* at least 0.85 of each; a new run with --begin-from {physics.folder.path} and"
     with pytest.warns(UserWarning, match=again):
@@ -71,11 +80,17 @@ def test_where_all_tasks_are_held_loop_is_left_out(physics, monkeypatch):
     assert not any("return" in line for line in logged)
 
 
+class Unaware(Hold):
+    """Goes on as where another task is not held."""
+
+    everything = property(lambda _: False, lambda *_: None)
+
+
 def test_a_task_that_is_held_stays_and_one_that_is_not_is_learned_as_without(physics, monkeypatch):
     source = physics.policy("sft").state_dict()
     with monkeypatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        patch.setattr(Hold, "everything", False)  # as where another task is not held: LOOP goes on
+        patch.setattr("post_train.Hold", Unaware)
         held, logged = learned(physics, patch, 1.0, 0.85)
     assert all(torch.equal(value, source[name]) for name, value in held.items())
     assert [line["held_groups"] for line in logged if "return" in line] == [1.0, 1.0]
