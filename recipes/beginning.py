@@ -28,7 +28,13 @@ DEPENDS_ON: dict[str, tuple[str, ...]] = {
     "explore": ("explore", "scale_floor", "scale_share", "post_train.ratio_level"),
     "train_world_model": ("world_model",),
     "train_reflector": ("reflector",),
-    "adapt": ("adapt", *(f"post_train.{name}" for name in ("hold", "hold_from", "lora_rank", "scale_factor"))),
+    "adapt": (
+        "adapt",
+        "post_train.hold",
+        "post_train.hold_from",
+        "post_train.lora_rank",
+        "post_train.scale_factor",
+    ),
     "post_train": ("adapt", "post_train", "scale_floor", "scale_share", "evaluate.num_envs"),
 }
 """Settings, or sections of them, that a kind of stage depends on besides those of the stages before it and those of the

@@ -116,10 +116,12 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             "post_train.hold asks what greedy rollouts solved: explore.scale_factors must hold 0, got "
             f"{', '.join(f'{factor:g}' for factor in config.explore.scale_factors)}"
         )
-    if config.post_train.env == "tabletop" and config.rounds > 1:
-        raise ValueError(
-            f"rounds is of imagination: it must be 1 where post_train.env is tabletop, got {config.rounds}"
-        )
+    if config.post_train.env == "tabletop":
+        for name, count, least in (("adapt.steps", config.adapt.steps, 0), ("rounds", config.rounds, 1)):
+            if count > least:
+                raise ValueError(
+                    f"{name} is of imagination: it must be {least} where post_train.env is tabletop, got {count}"
+                )
     if config.explore.replay_share and not replays_per_task(config.explore):
         raise ValueError(
             f"explore.replay_share {config.explore.replay_share} of {config.explore.episodes_per_task} episodes a task "

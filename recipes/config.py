@@ -152,8 +152,7 @@ class Reflector:
 
 @dataclass(frozen=True)
 class Adapt:
-    """Before LOOP in imagination the policy learns to do on imagined frames what it does on the real ones
-    (``adapt.py``); in the physics there is nothing to adapt to."""
+    """Before LOOP the policy learns to do on imagined frames what it does on the real ones (``adapt.py``)."""
 
     steps: int = 0
     """0 leaves the stage out."""

@@ -42,7 +42,7 @@ class Hold:
         self._tasks, self.everything = torch.tensor(held, dtype=torch.long), len(held) == len(run.config.tasks)
         if self.everything:
             warnings.warn(
-                f"all tasks are held, so LOOP is left out: greedy exploration solved at least "
+                f"all tasks are held, so adapting and LOOP are left out: greedy exploration solved at least "
                 f"{min(shares.values()):.2f} of each; a new run with --begin-from {run.folder.path} and "
                 "--post-train.hold 0, or with a higher --post-train.hold-from, learns",
                 stacklevel=2,

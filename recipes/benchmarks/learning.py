@@ -108,12 +108,15 @@ class Measured:
 
 def main(settings: Learning) -> None:
     learned = dataclasses.replace(settings.config.post_train, env="tabletop", probe_every=0, hold=0.0)
-    config = dataclasses.replace(settings.config, post_train=learned)
+    adapt = dataclasses.replace(settings.config.adapt, steps=0)  # the preset's, of imagination
+    config = dataclasses.replace(settings.config, post_train=learned, adapt=adapt)
     with refusals():
         check_corruption(settings.corruption, len(config.tasks))
         measured_iterations(learned.iterations, settings.growth)
         measured_states(config, settings.states)
         checkpoint = start_of(settings.source, config)
+    if settings.config.post_train.hold:
+        print("all tasks learn: --post-train.hold is not for a curve, whose folder holds no exploration")
     run = open_run(config)
     with refusals():
         describe(run.folder, description(settings, checkpoint))

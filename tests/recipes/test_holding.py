@@ -13,7 +13,7 @@ from tensordict import TensorDict
 import holding
 from adapt import adapt
 from checks import check_config, check_loop
-from config import GOAL_TASKS, Adapt
+from config import GOAL_TASKS
 from holding import Hold, solved_shares
 from physics import exploring_actor
 from post_train import post_train
@@ -38,8 +38,7 @@ def test_what_cannot_be_held_is_refused_before_any_work_and_the_physics_asks_exp
     held = dataclasses.replace(SMALL, post_train=dataclasses.replace(SMALL.post_train, hold=1.0))
     with pytest.raises(ValueError, match=r"explore.scale_factors must hold 0, got 1$"):
         check_config(held)  # whose exploration has no greedy part
-    learned = dataclasses.replace(SMALL.post_train, hold=1.0, env="tabletop")
-    physics = dataclasses.replace(SMALL, post_train=learned, adapt=Adapt(steps=2))  # of imagination alone
+    physics = dataclasses.replace(SMALL, post_train=dataclasses.replace(SMALL.post_train, hold=1.0, env="tabletop"))
     assert [stage.name for stage in plan(physics)] == ["demonstrate", "sft", "explore", "post_train", "evaluate"]
     with pytest.raises(ValueError, match=r"post_train.hold is for policies with a mean, and Tokens acts by tokens"):
         check_loop(held, token_policy())
@@ -72,7 +71,7 @@ def test_where_all_tasks_are_held_nothing_is_adapted(physics, monkeypatch):
 
 
 def test_where_all_tasks_are_held_loop_is_left_out(physics, monkeypatch):
-    again = rf"LOOP is left out: .* at least 0.85 of each; a new run with --begin-from {physics.folder.path} and"
+    again = rf"LOOP are left out: .* at least 0.85 of each; a new run with --begin-from {physics.folder.path} and"
     with pytest.warns(UserWarning, match=again):
         held, logged = learned(physics, monkeypatch, 1.0, 0.85)
     source = physics.policy("sft").state_dict()

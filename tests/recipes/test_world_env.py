@@ -11,7 +11,7 @@ import torch
 
 import world_env
 from checks import check_config
-from config import GOAL_TASKS, PRESETS, SFT, Demonstrate, Evaluate, Explore, PostTrain, Reflector, WorldModel
+from config import GOAL_TASKS, PRESETS, SFT, Adapt, Demonstrate, Evaluate, Explore, PostTrain, Reflector, WorldModel
 from episodes import demonstrations_and_exploration
 from imagination import contexts_of
 from parts import COMPACT, Part
@@ -66,6 +66,10 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"explore": Explore(replay_share=1.0)}, r"explore.replay_share must lie in \[0, 1\), got 1"),
         ({"explore": Explore(replay_share=0.999)}, "explore.replay_share 0.999 of 160 episodes a task leaves none"),
         ({"explore": Explore(replay_share=0.002)}, "explore.replay_share 0.002 of 160 episodes a task is none: raise"),
+        (
+            {"post_train": PostTrain(env="tabletop"), "adapt": Adapt(steps=10)},
+            "adapt.steps is of imagination: it must be 0 where post_train.env is tabletop, got 10",
+        ),
         ({"post_train": PostTrain(env="tabletop"), "rounds": 2}, "rounds is of imagination: it must be 1 .* got 2"),
         ({"explore": Explore(replay_shift_m=0.5)}, "explore.replay_shift_m must lie between 0 and 0.2"),
         (
