@@ -43,6 +43,7 @@ _SWITCHES = {
     "adapt": "adapt.steps",
     "explore.replay_shift_m": "explore.replay_share",
     "post_train.hold_from": "post_train.hold",
+    "post_train.held_share": "post_train.hold",
     "post_train.probe_contexts": "post_train.probe_every",
 }
 """Settings, or sections of them, that are not read while another one is 0; that one always counts."""
