@@ -41,7 +41,6 @@ DEPENDS_ON: dict[str, tuple[str, ...]] = {
 whole run: its tasks, seed, cameras and so on."""
 _SWITCHES = {
     "adapt": "adapt.steps",
-    "explore.replay_shift_m": "explore.replay_share",
     "post_train.hold_from": "post_train.hold",
     "post_train.held_share": "post_train.hold",
     "post_train.probe_contexts": "post_train.probe_every",

@@ -10,7 +10,6 @@ from loggers import check_loggers
 from parts import COMPACT, Parts
 from physics import tabletop
 from ranges import check_ranges
-from replayed import replays_per_task
 from worldenv_trl.data import ACTIONS
 from worldenv_trl.devices import choose_device
 from worldenv_trl.policies import Policy, TokenPolicy
@@ -122,18 +121,6 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
                 raise ValueError(
                     f"{name} is of imagination: it must be {least} where post_train.env is tabletop, got {count}"
                 )
-    if config.explore.replay_share and not replays_per_task(config.explore):
-        raise ValueError(
-            f"explore.replay_share {config.explore.replay_share} of {config.explore.episodes_per_task} episodes a task "
-            "is none: raise it, or set it to 0"
-        )
-    if replays_per_task(config.explore) >= config.explore.episodes_per_task:
-        raise ValueError(
-            f"explore.replay_share {config.explore.replay_share} of {config.explore.episodes_per_task} episodes a task "
-            "leaves none of the policy's own to be played again: lower it"
-        )
-    if config.reflector.open_loop and not config.reflector.path_steps:
-        raise ValueError("reflector.open_loop is of the reflector that judges paths: set reflector.path_steps, got 0")
     try:
         StopRule(config.reflector.threshold, config.reflector.consecutive)
     except ValueError as error:

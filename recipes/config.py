@@ -84,16 +84,10 @@ class Explore:
     """The policy's own rollouts in the scenes, perturbed: data for both models."""
 
     episodes_per_task: int = 160
-    """Those that are no replays are rounded up to whole waves of ``num_envs`` for each scale factor."""
+    """Rounded up to whole waves of ``num_envs`` for each scale factor."""
     scale_factors: tuple[float, ...] = (0.0, 0.5, 1.0, 2.0)
     """Multiples of the policy's Laplace scale, or of its temperature if it acts by tokens; the episodes are shared out
     equally. 0 is the greedy policy."""
-    replay_share: float = 0.0
-    """Share of the episodes that play successes among the others again, the hand moved aside: noise alone does not show
-    what a smooth path beside the right one comes to, and smooth is what LOOP makes a policy. 0, for the judge is better
-    with it (.25 was measured) and LOOP is not, on three seeds of three tasks (``RESULTS.md``)."""
-    replay_shift_m: float = 0.08
-    """The farthest that a hand is moved there (m), in any direction."""
     num_envs: int = 32
 
 
@@ -138,10 +132,6 @@ class Reflector:
     0. Half as many come before, in which it finds the places that matter there. The first one then judges real frames
     alone, and no imagined episodes are made for it. A batch is shared by the tasks: ten want three times what three
     do."""
-    open_loop: bool = False
-    """Half of what the one that judges in imagination says is read from no more than the path up to a chunk after the
-    hand has come down (``PathReflector``'s ``open_loop_frames``). How a hand goes on once it can see what it has done
-    betrays in the world how its rollout will end; in imagination it says nothing."""
     holdout: float = 0.2
     """Share of the exploration's initial states kept out, for the figures and for the choice of the stopping rule."""
     threshold: float = 0.5

@@ -1,5 +1,4 @@
-"""The policy's own rollouts in the scenes at several multiples of its trained scale, then successes among them moved
-aside, labelled by the physics.
+"""The policy's own rollouts in the scenes at several multiples of its trained scale, labelled by the physics.
 
 Alone: ``python recipes/explore.py improve --run-dir runs/improve``.
 """
@@ -13,7 +12,6 @@ from typing import Any
 from collecting import of_worker
 from config import Explore
 from physics import chunk_player, exploring_actor, reached_goal, recording, step_env
-from replayed import Successes, play_again, replays_per_task
 from resumable import Outside, Resumable
 from resumable_recording import ResumableRecording
 from run import Run
@@ -26,7 +24,6 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
     run.seed_everything(target)
     model = run.policy(policy).eval()
     waves = waves_per_scale(settings, len(config.tasks))
-    successes = Successes(config.max_steps) if replays_per_task(settings) else None
     # After success the rollout goes on: the models must see what undoes it (World-Env Figure 6).
     options: dict[str, Any] = {
         "terminate_on_success": False,
@@ -60,32 +57,26 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
                 collector=progress,
                 recording=Outside(recorded),
                 reached=reached,
-                successes=successes,
             )
             collected = iter(collector)
             for _ in left.bar(f"{target} scale x{factor:g}", "wave"):
                 rollouts = next(collected)[:, 0]
                 recorded.writer.write(rollouts)
-                if successes is not None:
-                    successes.note(rollouts)
                 reached.append(reached_goal(rollouts).float().mean().item())
             collector.shutdown(close_env=False)
             folder.log(
                 target, scale_factor=factor, episodes=waves * settings.num_envs, success=sum(reached) / len(reached)
             )
-        if successes is not None:
-            play_again(run, model, successes, recorded, target)
     env.close()
 
 
 def waves_per_scale(settings: Explore, tasks: int) -> int:
-    """Of ``num_envs`` rollouts; what is played again comes on top."""
-    episodes = (settings.episodes_per_task - replays_per_task(settings)) * tasks
-    return -(-episodes // (len(settings.scale_factors) * settings.num_envs))
+    """Of ``num_envs`` rollouts."""
+    return -(-settings.episodes_per_task * tasks // (len(settings.scale_factors) * settings.num_envs))
 
 
-def own_episodes(settings: Explore, tasks: int) -> int:
-    """Of a round, without those that are played again: they come first in its recording."""
+def episodes_of_round(settings: Explore, tasks: int) -> int:
+    """Those of all tasks, rounded up to whole waves."""
     return waves_per_scale(settings, tasks) * len(settings.scale_factors) * settings.num_envs
 
 

@@ -136,8 +136,7 @@ def make_reflector(config: WorldEnvConfig) -> CompactReflector | DualReflector:
                 "reflector.path_steps needs a camera that is fixed in the world, got cameras "
                 f"{', '.join(config.cameras)}: add agentview, or set it to 0"
             )
-        frames = config.chunk_length if settings.open_loop else 0
-        path = PathReflectorConfig.for_cameras(cameras, image_size=config.image_size, open_loop_frames=frames)
+        path = PathReflectorConfig.for_cameras(cameras, image_size=config.image_size)
         reflector = DualReflector(
             DualReflectorConfig(video, path),
             lessons,

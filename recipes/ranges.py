@@ -8,7 +8,6 @@ from operator import attrgetter
 from typing import Any
 
 _FARTHEST_SHIFT_M = 0.2
-_FARTHEST_REPLAY_M = 0.2
 _FARTHEST_PLACE_M = 0.035  # of the radii that policies.PlaceShift has by default
 
 
@@ -65,8 +64,6 @@ RANGES: dict[str, Range] = {
     "sft.scale_lr": _RATE,
     "explore.episodes_per_task": _ONE,
     "explore.scale_factors": _WEIGHT,
-    "explore.replay_share": Range(0, 1, below=True),
-    "explore.replay_shift_m": Range(0, _FARTHEST_REPLAY_M, why="farther, a hand leaves the table"),
     "explore.num_envs": _ONE,
     "world_model.steps": _ONE,
     "world_model.refit_steps": _ONE,

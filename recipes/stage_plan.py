@@ -6,11 +6,10 @@ import math
 from dataclasses import dataclass
 
 from config import WorldEnvConfig
-from explore import own_episodes
+from explore import episodes_of_round
 from part_costs import Call, Size
 from probes import probed_iterations
 from rehearsal import Rehearsal
-from replayed import replays_per_task
 from stages import Stage, plan
 from updates import rows_at_once
 from worldenv_trl.reflectors import VLMLessons, VLMReflectorConfig
@@ -98,9 +97,8 @@ def decisions(config: WorldEnvConfig) -> int:
 
 
 def explored(config: WorldEnvConfig) -> int:
-    """Episodes of a round of exploration, rounded up to whole waves."""
-    settings, tasks = config.explore, len(config.tasks)
-    return own_episodes(settings, tasks) + replays_per_task(settings) * tasks
+    """Episodes of a round of exploration."""
+    return episodes_of_round(config.explore, len(config.tasks))
 
 
 def iteration_flops(config: WorldEnvConfig, found: Rehearsal) -> float:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 import tyro
 from torch import Tensor
 
@@ -22,9 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from command_line import at_least, refusals, writable
 from episodes import demonstrations_and_exploration, split_by_context
-from explore import own_episodes
 from gather_evidence import read_config
-from replayed import directions, moved_aside
 from run import Run
 from run_folder import RunFolder
 from threads import use_threads
@@ -34,6 +33,8 @@ from worldenv_trl.data import Episodes, score_episodes
 from worldenv_trl.metrics import wilson_interval
 from worldenv_trl.reflectors import Reflector
 from worldenv_trl.report import RunRecord
+
+MOVED_IN = 12  # steps: before a hand has come down
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,6 @@ def kept_out_successes(run: Run, per_task: int) -> Episodes:
     """
     config = run.config
     _, explored = demonstrations_and_exploration(run, 1)
-    explored = explored[: own_episodes(config.explore, len(config.tasks))]
     _, kept_out = split_by_context(explored, config.reflector.holdout, run.seed("held-out contexts"))
     task, reached = kept_out[keys.TASK_ID].squeeze(-1), kept_out["success"].any(-1)
     rows = [((task == number) & reached).nonzero().squeeze(-1)[:per_task] for number in range(len(config.tasks))]
@@ -111,6 +111,21 @@ def measure(run: Run, judge: Reflector, successes: Episodes, settings: Settings)
                 figures = {"successes": int(reached[chosen].sum()), "R": scores[chosen].mean().item()}
                 out[name]["at"][f"{distance:g}"] = figures | _by_outcome(scores[chosen], reached[chosen])
     return out
+
+
+def directions(count: int, drawn: torch.Generator) -> Tensor:
+    """Unit vectors [n, 3], all directions alike."""
+    return F.normalize(torch.randn(count, 3, generator=drawn), dim=-1)
+
+
+def moved_aside(actions: Tensor, shifts: Tensor) -> Tensor:
+    """Actions [n, T, 7] that take the hand to the same path moved by ``shifts`` [n, 3] (m), and along it.
+
+    Less far where an action would exceed [-1, 1].
+    """
+    moved = actions.clone()
+    moved[:, :MOVED_IN, :3] += shifts.unsqueeze(1) / (MOVED_IN * keys.POSITION_STEP)
+    return moved.clamp(-1, 1)
 
 
 def _by_outcome(scores: Tensor, reached: Tensor) -> dict[str, float | None]:

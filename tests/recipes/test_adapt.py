@@ -28,7 +28,7 @@ def run(tmp_path_factory):
         tmp_path_factory.mktemp("adapt"),
         max_steps=40,
         tasks=config.GOAL_TASKS[1:],
-        explore=config.Explore(episodes_per_task=6, num_envs=4, scale_factors=(2.0, 0.0, 1.0), replay_share=0.0),
+        explore=config.Explore(episodes_per_task=6, num_envs=4, scale_factors=(2.0, 0.0, 1.0)),
         adapt=config.Adapt(steps=150, episodes_per_task=2, batch_size=8, lr=2e-5),
     )
     policy = run.policy("sft")

@@ -24,8 +24,8 @@ from world_env import run_all
 WHOLE = dataclasses.replace(
     SMALL,
     max_steps=40,
-    explore=config.Explore(episodes_per_task=8, num_envs=4, scale_factors=(0.0, 1.0), replay_share=0.25),
-    reflector=dataclasses.replace(SMALL.reflector, path_steps=2, open_loop=True),
+    explore=config.Explore(episodes_per_task=8, num_envs=4, scale_factors=(0.0, 1.0)),
+    reflector=dataclasses.replace(SMALL.reflector, path_steps=2),
     adapt=config.Adapt(steps=2, episodes_per_task=2, batch_size=2),
     post_train=dataclasses.replace(SMALL.post_train, iterations=2, hold=1.0),
 )
@@ -107,7 +107,6 @@ def test_a_stage_reads_no_setting_that_could_change_unnoticed(whole):
         ({"post_train__scale_factor": 0.5}, "reflector"),
         ({"adapt__steps": 0}, "reflector"),
         ({"adapt__lr": 1e-5}, "reflector"),
-        ({"explore__replay_shift_m": 0.02}, "sft"),
         ({"post_train__hold_from": 0.5}, "reflector"),
         ({"post_train__probe_contexts": 3}, "adapted"),
         ({"post_train__hold": 0.0}, "reflector"),
@@ -130,7 +129,6 @@ def test_what_comes_over_ends_where_a_setting_differs(whole, tmp_path, change, l
     ("off", "change"),
     [
         ("adapt.steps", {"adapt__lr": 1e-5, "adapt__batch_size": 3}),
-        ("explore.replay_share", {"explore__replay_shift_m": 0.02}),
         ("post_train.hold", {"post_train__hold_from": 0.5, "post_train__held_share": 0.5}),
         ("post_train.probe_every", {"post_train__probe_contexts": 3}),
     ],

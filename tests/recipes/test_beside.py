@@ -17,6 +17,7 @@ from demonstrate import demonstrate
 from parts import make_policy, make_reflector
 from run import Run, write_rules
 from stages import open_run
+from worldenv_trl import keys
 from worldenv_trl.reflectors import Reflector, StopRule
 
 TASK = config.GOAL_TASKS[2:]
@@ -31,7 +32,7 @@ def run(tmp_path_factory) -> Run:
         tasks=TASK,
         max_steps=40,
         demonstrate=config.Demonstrate(episodes_per_task=4),
-        explore=dataclasses.replace(SMALL.explore, episodes_per_task=4, replay_share=0.0),
+        explore=dataclasses.replace(SMALL.explore, episodes_per_task=4),
         reflector=dataclasses.replace(SMALL.reflector, holdout=0.75, path_steps=1),
     )
     run = open_run(settings)
@@ -92,6 +93,22 @@ def test_the_judge_is_given_the_moved_path(run):
     assert torch.equal(successes["kinematic_states"][..., 7:10], states)  # nothing is changed in place
     alone = dataclasses.replace(settings, distances=(0.05,))  # a path goes the same way at every distance
     assert module.measure(run, Farther(), successes, alone)["all"]["at"]["0.05"] == figures["0.05"]
+
+
+def test_actions_move_the_hand_by_what_is_asked():
+    module, asked = benchmark("beside"), torch.tensor([[0.03, -0.06, 0.02], [0.0, 0.0, 0.0]])
+    moved = module.moved_aside(torch.zeros(2, 20, 7), asked)
+    torch.testing.assert_close(keys.POSITION_STEP * moved.sum(1)[:, :3], asked)
+    assert not moved[..., 3:].any() and not moved[:, module.MOVED_IN :].any()
+    assert module.moved_aside(torch.ones(1, 20, 7), torch.full((1, 3), 0.1)).max() == 1  # an action goes no further
+
+
+def test_hands_are_moved_as_often_in_every_direction():
+    towards = benchmark("beside").directions(4000, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(towards.norm(dim=-1), torch.ones(4000))
+    # Of a direction in space every coordinate is uniform in [-1, 1] (Archimedes).
+    for coordinate in towards.unbind(-1):
+        assert all(abs((coordinate < bound).float().mean() - (1 + bound) / 2) < 0.03 for bound in (-0.5, 0.0, 0.5))
 
 
 def test_what_cannot_be_measured_is_refused(run):

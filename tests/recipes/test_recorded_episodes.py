@@ -59,7 +59,7 @@ def explored(tmp_path_factory):
     run = small_untrained(
         tmp_path_factory.mktemp("episodes"),
         max_steps=40,
-        explore=config.Explore(episodes_per_task=4, num_envs=2, scale_factors=(1.0, 0.0), replay_share=0.0),
+        explore=config.Explore(episodes_per_task=4, num_envs=2, scale_factors=(1.0, 0.0)),
     )
     demonstrate(run)
     explore(run)

@@ -51,10 +51,3 @@ def test_what_a_loader_knows_is_not_guessed(tiny):
     swapped = Part(COMPACT.policy.make, load)
     assert swapped.known == () and COMPACT.world_model.known == ("VideoWorldModel",)
     open_run(tiny, dataclasses.replace(COMPACT, policy=swapped)).close()
-
-
-@pytest.mark.parametrize("open_loop", [False, True])
-def test_what_a_hand_does_open_loop_is_a_chunk(tiny, open_loop):
-    told = dataclasses.replace(tiny.reflector, path_steps=1, open_loop=open_loop)
-    reflector = COMPACT.reflector.make(dataclasses.replace(tiny, reflector=told))
-    assert reflector.path.config.open_loop_frames == (tiny.chunk_length if open_loop else 0)

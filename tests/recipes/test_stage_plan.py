@@ -19,7 +19,7 @@ CONFIG = dataclasses.replace(
     max_steps=16,  # two decisions of 8 steps
     demonstrate=settings.Demonstrate(episodes_per_task=1),
     sft=settings.SFT(steps=10, batch_size=8, scale_steps=5),
-    explore=settings.Explore(episodes_per_task=8, num_envs=4, scale_factors=(0.0, 1.0), replay_share=0.5),
+    explore=settings.Explore(episodes_per_task=8, num_envs=4, scale_factors=(0.0, 1.0)),
     world_model=settings.WorldModel(steps=3, refit_steps=2, batch_size=8, holdout=0.25),
     reflector=settings.Reflector(imagined_share=0.5, holdout=0.25),
     post_train=settings.PostTrain(iterations=3, groups=2, group_size=4, epochs=2, minibatch_size=8, probe_every=0),
@@ -51,7 +51,7 @@ def found() -> Rehearsal:
 
 
 def test_a_stage_takes_its_rows_times_what_a_row_takes():
-    assert explored(CONFIG) == 2 * 4 + 2 * 4  # of two scale factors, in waves of 4, and of two tasks, played again
+    assert explored(CONFIG) == 2 * 2 * 4  # of two scale factors, two waves of 4
     judged = 8 * 0.5 + 2 * 7.0  # eight frames seen, two judgements
     assert stage_flops("demonstrate", CONFIG, found()) == 0
     assert stage_flops("sft", CONFIG, found()) == 8 * (10 * 3 + 5 * 1)

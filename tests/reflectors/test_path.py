@@ -95,7 +95,7 @@ def test_scores_are_those_of_each_prefix_alone_in_whatever_pieces_the_path_comes
             levels = reflector.places.levels([texts[row]])
             view = reflector.views_of([texts[row]])
             _, places = reflector.places(one["front"].unsqueeze(1), view, words, levels)
-            alone = reflector.logits(looks, reflector.path(poses, places), words)[:, -1, :, 0].sigmoid().mean()
+            alone = reflector.logits(looks, reflector.path(poses, places), words)[:, -1].sigmoid().mean()
             torch.testing.assert_close(streamed[row, last], alone)
 
 

@@ -19,7 +19,7 @@ from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.reflectors.base import Lesson, Reflector
 from worldenv_trl.reflectors.goal import MAX_WORDS, Goal
 from worldenv_trl.reflectors.path_lessons import PathLessons, lessons_of
-from worldenv_trl.reflectors.places import KINDS, Places, landings, offsets
+from worldenv_trl.reflectors.places import KINDS, Places, offsets
 from worldenv_trl.robot.camera import Camera
 
 if TYPE_CHECKING:
@@ -43,8 +43,6 @@ class PathReflectorConfig:
         window: side of what is seen around the hand, in shares of the frame's.
         crop_size: pixels (px) that this window is resampled to.
         stride: frames from one look to the next.
-        open_loop_frames: how many frames a hand goes on open loop after it has come down, before it can answer to
-            what came of that: a policy's chunk. At 0 R is read from the whole path alone, how it answers included.
         feature_dim: length of what is seen at a look.
         width: channels of the convolutions over time.
         dropout: while learning.
@@ -59,7 +57,6 @@ class PathReflectorConfig:
     window: float = 0.28
     crop_size: int = 18
     stride: int = 2
-    open_loop_frames: int = 0
     feature_dim: int = 32
     width: int = 96
     dropout: float = 0.2
@@ -80,8 +77,6 @@ class PathReflectorConfig:
                 "stride, feature_dim, width and members must be at least 1 and crop_size at least 8, got "
                 f"{self.stride}, {self.feature_dim}, {self.width}, {self.members} and {self.crop_size}"
             )
-        if self.open_loop_frames < 0:
-            raise ValueError(f"open_loop_frames must be at least 0, got {self.open_loop_frames}")
         if not 0 < self.window <= 1 or not 0 <= self.dropout < 1:
             raise ValueError(f"window must be in (0, 1] and dropout in [0, 1), got {self.window} and {self.dropout}")
 
@@ -112,13 +107,9 @@ class PathReflector(Reflector, Pretrained):
     does not see either. It must have seen smooth paths fail: where noise alone made them fail, smoothness is what it
     learns to call success, wherever the hand goes.
 
-    A hand that sees the world answers to what happens there: it goes back for what it missed, or it goes on. Whoever
-    watches real rollouts learns to read that, and reads it where there is nothing to be read: in a dream the hand goes
-    on, whatever it did (causal confusion, arXiv:1905.11979). With ``open_loop_frames`` R is the mean of two judgements.
-    One reads the whole path. The other is the product of two chances: that the goal will be reached, asked of no more
-    of the path than that long after the hand has come down, before it can have answered; and that it is reached by now
-    if it ever is, which is learned from episodes that succeed, and so says when and not whether. The first is misled
-    where hands answer, the second does not see what is decided later, such as where a thing is put down.
+    A hand that sees the world answers to what happens there: it goes back for what it missed, or it goes on. R of real
+    rollouts reads that, too, and in a dream, where a hand goes on whatever it did, there is nothing to be read (causal
+    confusion, arXiv:1905.11979).
 
     A hand view is what others predict as a second camera (Ctrl-World, 2510.10125); success told for every frame is the
     reward head of World-VLA-Loop (2602.06508).
@@ -216,22 +207,7 @@ class PathReflector(Reflector, Pretrained):
         stride = self.config.stride
         path = self.path(state["poses"][:, ::stride], state["places"])
         logits = self.logits(state["looks"][:, ::stride], path, state["words"])
-        chances = logits.sigmoid().mean(2)
-        return self._judged(chances, state["poses"][:, ::stride, :3]).gather(1, place // stride)
-
-    def _judged(self, chances: Tensor, hands: Tensor) -> Tensor:
-        """R [n, L] of what is said at each look, [n, L, A], and hands [n, L, 3]."""
-        if not self.config.open_loop_frames:
-            return chances[..., 0]
-        look = torch.arange(chances.shape[1], device=hands.device)
-        whole, when, promise = chances.unbind(-1)
-        promised = promise.gather(1, torch.minimum(look, self.asked(hands).unsqueeze(-1)))
-        return (whole + when * promised) / 2
-
-    def asked(self, hands: Tensor) -> Tensor:
-        """The last look, int64 [n], at which hands [n, L, 3] cannot have answered to what they did: L or more where
-        that is not among them."""
-        return landings(hands) + -(-self.config.open_loop_frames // self.config.stride)
+        return logits.sigmoid().mean(2).gather(1, place // stride)
 
     def moves(self, poses: Tensor) -> Tensor:
         """Poses [n, L, 13], one at each look, and how they changed, normalised: [n, L, 26]."""
@@ -279,8 +255,7 @@ class PathReflector(Reflector, Pretrained):
         return torch.stack([cast(_Member, member).look(crops) for member in self.members], 2)
 
     def logits(self, looks: Tensor, path: Tensor, words: Tensor) -> Tensor:
-        """Log-odds [P, L, M, A] of every prefix and member: that the goal is reached by then; with ``open_loop_frames``
-        also that it is if it ever is, and that it will be.
+        """Log-odds [P, L, M] of every prefix and member: that the goal is reached by then.
 
         Args:
             looks: [P, L, M, F], what the members saw at each look.
@@ -307,31 +282,25 @@ class PathReflector(Reflector, Pretrained):
 
     def training_loss(self, batch: TensorDictBase) -> TensorDict:
         """Of paths the binary cross-entropy of "reached by then", mean over episodes of the mean over looks plus that
-        of the last; with ``open_loop_frames`` the same of "reached by then if ever", 0 for episodes that do not
-        succeed, and that of "will be reached" at the look where it is asked. Of places the divergence of the maps from
-        what they are taught.
+        of the last. Of places the divergence of the maps from what they are taught.
 
         Args:
             batch: [P] of one lesson. Of ``paths``: ``crops`` floats [P, L, 3 V, S, S], ``path`` [P, L, 26 + F],
                 ``words`` int64 [P, W], ``label`` bool [P, L], ``weight`` [P, L]: 1 up to the episode's end, 0 behind
-                it; with ``open_loop_frames`` ``asked`` int64 [P], a look. Of ``places``: ``first`` uint8
-                [P, V, 3, H, W], ``view`` int64 [P, V], ``words``, ``levels`` [P, K] (m) and ``place`` [P, K, 3] (m).
+                it. Of ``places``: ``first`` uint8 [P, V, 3, H, W], ``view`` int64 [P, V], ``words``, ``levels`` [P, K]
+                (m) and ``place`` [P, K, 3] (m).
         """
         if "place" in batch.keys():  # noqa: SIM118
             return self._places_loss(batch)
         label, weight = batch["label"].float(), batch["weight"]
-        looks = self.look(batch["crops"])
-        answers = self.logits(looks, batch["path"], batch["words"])
+        logits = self.logits(self.look(batch["crops"]), batch["path"], batch["words"])
+        each = F.binary_cross_entropy_with_logits(logits, label.unsqueeze(-1).expand_as(logits), reduction="none")
         last = (weight.sum(1).long() - 1).clamp(min=0)
         rows = torch.arange(len(last), device=last.device)
-        decides, outcome = answers[rows, last, :, 0], label[rows, last].unsqueeze(-1)
-        told = _cross_entropy(answers[..., 0], label, weight, last)
-        if self.config.open_loop_frames:
-            promise = answers[rows, torch.minimum(batch["asked"], last), :, 2]
-            promised = F.binary_cross_entropy_with_logits(promise, outcome.expand_as(promise), reduction="none")
-            told = told + outcome * _cross_entropy(answers[..., 1], label, weight, last) + promised
-        loss = told.mean(0).sum()  # members learn on their own
-        right = (decides.detach().sigmoid().mean(-1) > 0.5) == (outcome.squeeze(-1) > 0.5)
+        whole = (each * weight.unsqueeze(-1)).sum(1) / weight.sum(1, keepdim=True)
+        loss = (whole + each[rows, last]).mean(0).sum()  # members learn on their own
+        decides = logits[rows, last].detach().sigmoid().mean(-1)
+        right = (decides > 0.5) == (label[rows, last] > 0.5)
         return TensorDict({"loss_reflector": loss, "accuracy": right.float().mean()})
 
     def _places_loss(self, batch: TensorDictBase) -> TensorDict:
@@ -340,13 +309,6 @@ class PathReflector(Reflector, Pretrained):
         loss = self.places.divergence(maps, self.pixels(place, view)).mean(0).sum()
         away = (points.detach().unflatten(1, (-1, KINDS)) - place[:, None, :, :2]).norm(dim=-1)
         return TensorDict({"loss_reflector": loss, "accuracy": (away < 0.02).float().mean()})
-
-
-def _cross_entropy(logits: Tensor, label: Tensor, weight: Tensor, last: Tensor) -> Tensor:
-    """Of logits [P, L, M] and label and weight [P, L]: the mean over looks plus that of the last, [P, M]."""
-    each = F.binary_cross_entropy_with_logits(logits, label.unsqueeze(-1).expand_as(logits), reduction="none")
-    whole = (each * weight.unsqueeze(-1)).sum(1) / weight.sum(1, keepdim=True)
-    return whole + each[torch.arange(len(last), device=last.device), last]
 
 
 class _Member(nn.Module):
@@ -365,7 +327,7 @@ class _Member(nn.Module):
         apart = offsets(torch.zeros(1, 1, 3), torch.zeros(1, KINDS * len(config.cameras), 2)).shape[-1]
         self.into = nn.Linear(config.feature_dim + 2 * POSE_DIM + apart, width)
         self.over_time = nn.ModuleList(_Causal(width, dilation, config.dropout) for dilation in _DILATIONS)
-        self.head = nn.Sequential(nn.Dropout(config.dropout), nn.Linear(3 * width, 3 if config.open_loop_frames else 1))
+        self.head = nn.Sequential(nn.Dropout(config.dropout), nn.Linear(3 * width, 1))
 
     def look(self, crops: Tensor) -> Tensor:
         """Features [P, L, F] of crops [P, L, 3 V, S, S]."""
@@ -380,7 +342,7 @@ class _Member(nn.Module):
             hidden = hidden + layer(hidden)
         count = torch.arange(1, hidden.shape[1] + 1, device=hidden.device).unsqueeze(-1)
         so_far = [hidden, hidden.cumsum(1) / count, hidden.cummax(1).values]
-        return self.head(torch.cat(so_far, -1))
+        return self.head(torch.cat(so_far, -1)).squeeze(-1)
 
 
 class _Causal(nn.Module):

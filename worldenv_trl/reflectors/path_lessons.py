@@ -117,9 +117,6 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
             crops.append(((seen + 0.5) * 255).round().to(torch.uint8))
             points.append(reflector.places(frames, view[here], words[here], levels[here])[1])
     looks, moves, hands, there = torch.cat(crops), reflector.moves(poses), poses[..., :3], torch.cat(points)
-    told = {"words": words, "label": label, "weight": weight}
-    if reflector.config.open_loop_frames:
-        told["asked"] = reflector.asked(hands)
 
     def sample_paths() -> TensorDict:
         rows = _drawn(tasks, plan.batch_size).to(device)
@@ -130,7 +127,9 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
             {
                 "crops": light * (looks[rows].float() / 255 - 0.5),
                 "path": torch.cat([moved + _PATH_NOISE * torch.randn_like(moved), apart], -1),
-                **{name: value[rows] for name, value in told.items()},
+                "words": words[rows],
+                "label": label[rows],
+                "weight": weight[rows],
             },
             batch_size=[len(rows)],
         )

@@ -14,7 +14,7 @@ from worldenv_trl.kinematics.densities import log_density
 from worldenv_trl.kinematics.planes import plane
 from worldenv_trl.reflectors.goal import Goal
 
-__all__ = ["KINDS", "Places", "landings", "offsets", "places_of"]
+__all__ = ["KINDS", "Places", "offsets", "places_of"]
 
 KINDS = 2  # where the hand comes down, where it is when the goal is reached
 _WAVELENGTHS = (0.24, 0.12, 0.06)  # m
@@ -119,10 +119,10 @@ def places_of(hands: Tensor, reached: Tensor) -> Tensor:
     """
     rows = torch.arange(len(hands), device=hands.device)
     end = torch.where(reached.any(1), reached.long().argmax(1), reached.shape[1] - 1)
-    return torch.stack([hands[rows, torch.minimum(landings(hands), end)], hands[rows, end]], 1)
+    return torch.stack([hands[rows, torch.minimum(_landings(hands), end)], hands[rows, end]], 1)
 
 
-def landings(hands: Tensor) -> Tensor:
+def _landings(hands: Tensor) -> Tensor:
     """The look at which each hand of [R, L, 3] (m) comes down, int64 [R]; L if it does not.
 
     It has come down where it first stops to fall, 3 cm or more below where it began: a look later that is known.
