@@ -58,10 +58,10 @@ def physics_outcomes(
     if indices is not None:  # these initial states of the split only
         episodes = len(indices)
         options = {"proprio": proprio} | starting_at(run.config, split, task, indices)
-    num_envs = min(run.config.evaluate.num_envs, episodes)
+    waves = -(-episodes // run.config.evaluate.num_envs)
+    num_envs = -(-episodes // waves)  # waves alike, instead of a last one that begins most of its states again
     options["with_sim_state"] = writer is not None
     env = outcomes_env(run.config, task, split, judge, num_envs, **options)
-    waves = -(-episodes // num_envs)
     collector = run.group_collector(
         env,
         DeviceBridge(actor),

@@ -172,6 +172,16 @@ def test_greedy_episodes_end_as_those_of_one_process_do(run):
     assert torch.equal(shared, physics_outcomes(local, actor, task, "test", 5)) and len(shared) == 5
 
 
+def test_greedy_episodes_come_in_waves_alike(run):
+    evaluate = dataclasses.replace(run.config.evaluate, num_envs=4)
+    local = dataclasses.replace(run, config=dataclasses.replace(run.config, collectors="local", evaluate=evaluate))
+    begun: list[list[int]] = []
+    writer = SimpleNamespace(write=lambda rollouts: begun.append(rollouts[keys.CONTEXT_ID][:, 0, 0].tolist()))
+    actor, task = laplace_actor(run.policy("sft")), run.config.tasks[0]
+    assert len(physics_outcomes(local, actor, task, "test", 6, writer=writer)) == 6
+    assert [len(wave) for wave in begun] == [3, 3] and len({*begun[0], *begun[1]}) == 6
+
+
 def test_imagined_frames_come_back_where_they_are_asked_for(run):
     env = TabletopEnv(run.config.tasks, 3, seed=0)
     contexts: TensorDict = env.reset()
