@@ -58,7 +58,7 @@ def check_collectors(config: WorldEnvConfig) -> None:
     physical, tasks = config.post_train.env == "tabletop", len(config.tasks)
     waves = [
         ("post_train.groups", config.post_train.groups, tasks if physical else 1),
-        ("evaluate.num_envs", min(config.evaluate.num_envs, config.evaluate.episodes_per_task), 1),
+        ("evaluate.num_envs", rows_of_waves(config.evaluate.episodes_per_task, config.evaluate.num_envs), 1),
     ]
     if not physical:
         waves.append(("explore.num_envs", config.explore.num_envs, tasks))
@@ -66,6 +66,16 @@ def check_collectors(config: WorldEnvConfig) -> None:
         check_shares(groups, spread.workers, deal, name)
     if spread.backend == "ray":
         check_ray()
+
+
+def rows_of_waves(episodes: int, most: int) -> int:
+    """Rows of the fewest waves alike of at most ``most`` rows: a last wave is not made of episodes that have been.
+
+    Examples:
+        >>> rows_of_waves(60, 50)
+        30
+    """
+    return -(-episodes // -(-episodes // most))
 
 
 def start_workers(spread: Spread, device: torch.device) -> Workers:

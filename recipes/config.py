@@ -186,8 +186,8 @@ class PostTrain:
     hold_from: float = 0.85
     """A task is solved if this share of its greedy rollouts in exploration reached the goal."""
     held_share: float = 1.0
-    """The largest share of a wave's groups that held tasks have in imagination, whose returns teach nothing; the others
-    have the rest. At 1 all tasks have as many. The physics deals its groups to all tasks in turn."""
+    """The largest share of imagination's groups, on average over the waves, that held tasks have, whose returns teach
+    nothing; the others have the rest. At 1 all tasks have as many. In the physics they always have."""
     scale_factor: float = 1.0
     """Behaviour and scored density use this multiple of the policy's scale, or of its temperature if it acts by tokens.
     """

@@ -63,7 +63,7 @@ class Hold:
         return torch.isin(tasks, self._tasks.to(tasks.device))
 
     def task_weights(self, share: float) -> dict[int, float]:
-        """``ImaginedEnv``'s, by which held tasks have ``share`` of the groups at most."""
+        """``ImaginedEnv``'s, by which held tasks have ``share`` of the groups at most, on average over the waves."""
         held = len(self._tasks)
         most = share * (self._count - held) / (held * (1 - share)) if held and share < 1 else 1.0
         return dict.fromkeys(self._tasks.tolist(), min(most, 1.0))

@@ -14,7 +14,7 @@ from torchrl.envs.transforms import TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
-from collecting import of_worker
+from collecting import of_worker, rows_of_waves
 from config import WorldEnvConfig
 from imagination import Imagination
 from parts import PROPRIO
@@ -58,8 +58,8 @@ def physics_outcomes(
     if indices is not None:  # these initial states of the split only
         episodes = len(indices)
         options = {"proprio": proprio} | starting_at(run.config, split, task, indices)
-    waves = -(-episodes // run.config.evaluate.num_envs)
-    num_envs = -(-episodes // waves)  # waves alike, instead of a last one that begins most of its states again
+    num_envs = rows_of_waves(episodes, run.config.evaluate.num_envs)
+    waves = -(-episodes // num_envs)
     options["with_sim_state"] = writer is not None
     env = outcomes_env(run.config, task, split, judge, num_envs, **options)
     collector = run.group_collector(

@@ -65,6 +65,9 @@ def test_every_wave_of_the_settings_must_have_work_for_all(tiny):
         open_run(enough)
     evaluated = dataclasses.replace(tiny.evaluate, episodes_per_task=9, num_envs=9)
     explored = dataclasses.replace(tiny.explore, num_envs=2)
+    uneven = dataclasses.replace(tiny.evaluate, episodes_per_task=4, num_envs=3)  # two waves of two
+    with pytest.raises(SystemExit, match=r"evaluate.num_envs=2: use at most 2"):
+        open_run(dataclasses.replace(enough, evaluate=uneven))
     with pytest.raises(SystemExit, match=r"explore.num_envs=2: use at most 2"):
         open_run(dataclasses.replace(enough, evaluate=evaluated, explore=explored))
 
