@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from config import WorldEnvConfig
-from run_folder import FREE, RunFolder, settings_of, stored_settings
+from run_folder import FREE, RunFolder, settings_gone, settings_of, stored_settings
 from worldenv_trl.record.mcap.index import MAGIC
 from worldenv_trl.scenes import load_task
 
@@ -113,9 +113,9 @@ def stages_in_common(config: WorldEnvConfig, stages: Sequence[Stage], source: Ru
     for task in config.tasks:
         if noted.get(task) not in (None, load_task(task).digest):
             return [], f"{task} has changed since it was made"
-    different = [name for name in now if before.get(name) != now[name]]
+    different = [*settings_gone(before, now), *(name for name in now if before.get(name) != now[name])]
     taken: list[Stage] = []
-    read, unread = _of_the_run(now), _switched_off(now) | {"world_model.refit_steps"}
+    read, unread = _of_the_run(before | now), _switched_off(now) | {"world_model.refit_steps"}
     for stage in (stage for stage in stages if stage.kind != "evaluate"):
         read |= set(DEPENDS_ON[stage.kind])
         if stage.kind == "sft" and config.parts == "real-size":
@@ -125,7 +125,8 @@ def stages_in_common(config: WorldEnvConfig, stages: Sequence[Stage], source: Ru
         changed = [name for name in different if name not in unread and {name, name.split(".")[0]} & read]
         if changed:
             name = changed[0]
-            return taken, f"{stage.name} is of {name}={before.get(name)!r} there and {now[name]!r} here"
+            here = f"and {now[name]!r} here" if name in now else "and no setting any more"
+            return taken, f"{stage.name} is of {name}={before.get(name)!r} there {here}"
         if not stage.finished_in(source):
             return taken, f"{stage.name} is not finished there"
         made = source.path / stage.makes

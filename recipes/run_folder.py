@@ -176,6 +176,11 @@ class RunFolder:
                 f"{self.path} was made with {key}={before.get(key)!r}, now {now[key]!r}{more}: "
                 "use another --run-dir, or the same settings to continue"
             )
+        for key in settings_gone(before, now):
+            raise ValueError(
+                f"{self.path} was made with {key}={before[key]!r}, which is no setting any more: use another "
+                "--run-dir, or the versions in its versions.json to continue"
+            )
 
     def _note_tasks(self, tasks: dict[str, str]) -> None:
         """Notes the digests of the tasks in ``tasks.json``, once."""
@@ -331,6 +336,12 @@ def settings_of(config: Any) -> dict[str, Any]:
 def stored_settings(path: Path, kind: type) -> dict[str, Any]:
     """Those in a ``config.yaml``; what has become a setting of ``kind`` since then was at its default."""
     return settings_of(kind()) | _flat(_read(path, yaml.safe_load))
+
+
+def settings_gone(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Names of those in ``before`` that ``now`` does not have and that were not off (0, false, none or empty): what
+    they did is not done any more."""
+    return [name for name in before if name not in now and before[name]]
 
 
 def _read(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:

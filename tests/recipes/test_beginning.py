@@ -148,6 +148,27 @@ def test_a_setting_that_another_one_has_switched_off_keeps_nothing_back(whole, t
 
 
 @pytest.mark.parametrize(
+    ("gone", "last"),
+    [
+        ({"explore": {"imagined_share": 0.25}}, "sft"),
+        ({"reflector": {"open_loop": True}}, "world_model"),
+        ({"explore": {"imagined_share": 0.0}, "reflector": {"open_loop": False}}, "post_train"),
+    ],
+)
+def test_what_was_done_by_a_setting_that_is_gone_does_not_come_over(whole, tmp_path, gone, last):
+    source = tmp_path / "source"
+    shutil.copytree(whole[0].run_dir, source)
+    stored = yaml.safe_load((source / "config.yaml").read_text())
+    for section, values in gone.items():
+        stored[section] |= values
+    (source / "config.yaml").write_text(yaml.safe_dump(stored))
+    settings = dataclasses.replace(whole[0], run_dir=tmp_path / "new", begin_from=source)
+    begun = beginning(settings, plan(settings), RunFolder(settings.run_dir))
+    assert [stage.name for stage in begun.stages] == STAGES[: STAGES.index(last) + 1]
+    assert begun.why == "" if last == STAGES[-1] else begun.why.endswith("there and no setting any more")
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"seed": 1}, "nothing of .*first can be taken, for demonstrate is of seed=0 there and 1 here"),

@@ -59,6 +59,16 @@ def test_a_setting_that_is_newer_than_the_folder_counts_as_its_default(tmp_path)
         folder.open(dataclasses.replace(config, sft=dataclasses.replace(config.sft, shift_px=3)))
 
 
+def test_a_setting_that_is_gone_and_was_on_is_refused_and_kept_by_name(config, folder):
+    stored = folder.path / "config.yaml"
+    stored.write_text(stored.read_text() + "mixed: 0\n")
+    folder.open(config)  # it did nothing
+    stored.write_text(stored.read_text() + "mixed: 0.5\n")
+    with pytest.raises(ValueError, match=r"made with mixed=0.5, which is no setting any more: use another --run-dir"):
+        folder.open(config)
+    assert "mixed: 0.5" in stored.read_text()
+
+
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
     path = tmp_path / "file"
     path.write_text("precious")

@@ -104,8 +104,8 @@ class PathReflector(Reflector, Pretrained):
     before the hand covered it. Causal convolutions over all of this and the hand's poses, and mean and maximum of what
     they say so far, give R of every prefix. It learns from real rollouts which path fails in which scene, and reads
     nothing that a world model paints, so ghosts of success cannot mislead it; what happens otherwise than commanded it
-    does not see either. It must have seen smooth paths fail: where noise alone made them fail, smoothness is what it
-    learns to call success, wherever the hand goes.
+    does not see either. Where noise alone makes paths fail it learns to call smoothness success, wherever the hand
+    goes: it wants greedy rollouts that fail, too.
 
     A hand that sees the world answers to what happens there: it goes back for what it missed, or it goes on. R of real
     rollouts reads that, too, and in a dream, where a hand goes on whatever it did, there is nothing to be read (causal
