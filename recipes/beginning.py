@@ -42,7 +42,6 @@ whole run: its tasks, seed, cameras and so on."""
 _SWITCHES = {
     "adapt": "adapt.steps",
     "post_train.hold_from": "post_train.hold",
-    "post_train.held_share": "post_train.hold",
     "post_train.probe_contexts": "post_train.probe_every",
 }
 """Settings, or sections of them, that are not read while another one is 0; that one always counts."""

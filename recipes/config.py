@@ -185,9 +185,6 @@ class PostTrain:
     solves; their returns are not learned from. At 0 nothing is held."""
     hold_from: float = 0.85
     """A task is solved if this share of its greedy rollouts in exploration reached the goal."""
-    held_share: float = 1.0
-    """The largest share of imagination's groups, on average over the waves, that held tasks have, whose returns teach
-    nothing; the others have the rest. At 1 all tasks have as many. In the physics they always have."""
     scale_factor: float = 1.0
     """Behaviour and scored density use this multiple of the policy's scale, or of its temperature if it acts by tokens.
     """

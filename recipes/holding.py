@@ -39,8 +39,7 @@ class Hold:
         policy = run.policy(source).eval()
         self._actor = exploring_actor(run.config, policy, run.config.post_train.scale_factor)
         shares, held = _solved(run, models)
-        self._tasks, self._count = torch.tensor(held, dtype=torch.long), len(run.config.tasks)
-        self.everything = len(held) == self._count
+        self._tasks, self.everything = torch.tensor(held, dtype=torch.long), len(held) == len(run.config.tasks)
         if self.everything:
             warnings.warn(
                 f"all tasks are held, so adapting and LOOP are left out: greedy exploration solved at least "
@@ -61,12 +60,6 @@ class Hold:
         """Bool [G]: the groups of a wave [G, N, T] whose task is held."""
         tasks = wave[keys.TASK_ID][:, 0, 0, 0]
         return torch.isin(tasks, self._tasks.to(tasks.device))
-
-    def task_weights(self, share: float) -> dict[int, float]:
-        """``ImaginedEnv``'s, by which held tasks have ``share`` of the groups at most, on average over the waves."""
-        held = len(self._tasks)
-        most = share * (self._count - held) / (held * (1 - share)) if held and share < 1 else 1.0
-        return dict.fromkeys(self._tasks.tolist(), min(most, 1.0))
 
     @torch.no_grad()
     def refer(self, decisions: TensorDictBase) -> None:

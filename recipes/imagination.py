@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -51,21 +51,14 @@ class Imagination:
         contexts: TensorDict | None = None,
         *,
         seed: int,
-        task_weights: Mapping[int, float] | None = None,
     ) -> TransformedEnv:
         """FK, action map, world model; the reflector gives the reward and stops; frames are not carried along."""
         groups, group_size = batch_size
-        make = self.makes(run, group_size, contexts, seed=seed, task_weights=task_weights)
+        make = self.makes(run, group_size, contexts, seed=seed)
         return make(groups, transforms=[FramesAside(run.folder.scratch)])
 
     def makes(
-        self,
-        run: Run,
-        group_size: int,
-        contexts: TensorDict | None = None,
-        *,
-        seed: int,
-        task_weights: Mapping[int, float] | None = None,
+        self, run: Run, group_size: int, contexts: TensorDict | None = None, *, seed: int
     ) -> Callable[..., TransformedEnv]:
         """``makes(...)(groups)`` is the same env for so many groups; frames are carried along."""
         return partial(
@@ -76,7 +69,6 @@ class Imagination:
             max_steps=run.config.max_steps,
             proprio=PROPRIO,
             seed=seed,
-            task_weights=task_weights,
         )
 
 

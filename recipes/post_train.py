@@ -73,7 +73,7 @@ def post_train(
             parameter.requires_grad_(False)
     actor = exploring_actor(config, policy, settings.scale_factor)
 
-    waves = Waves(run, target, models, actor, None if hold is None else hold.task_weights(settings.held_share))
+    waves = Waves(run, target, models, actor)
     imagination = waves.imagination
     read = [*policy.in_keys, *([keys.TOKENS] if isinstance(policy, TokenPolicy) else [])]
     read += [key for key in (keys.TOKEN_IS_PAD,) if key in actor.out_keys]

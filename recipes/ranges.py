@@ -97,7 +97,6 @@ RANGES: dict[str, Range] = {
     "post_train.draw": _ZERO,
     "post_train.hold": _WEIGHT,
     "post_train.hold_from": _SHARE,
-    "post_train.held_share": Range(0, 1, above=True, why="what is not seen again is forgotten"),
     "post_train.scale_factor": _RATE,
     "post_train.warmup_iterations": _ZERO,
     "post_train.max_kl": Range(0, above=True),

@@ -5,7 +5,7 @@ In imagination every process rolls out its groups; the physics is the main one's
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -40,9 +40,6 @@ _LEARNED_FROM = (
 class Waves:
     """The waves of a post-training run, one an iteration.
 
-    Args:
-        task_weights: of imagination's groups (``ImaginedEnv``); the physics deals its groups to the tasks in turn.
-
     Attributes:
         env: in which this process collects; None where another one does.
         collector: as above.
@@ -54,14 +51,7 @@ class Waves:
     collector: GroupCollector | None = None
     imagination: Imagination | None = None
 
-    def __init__(
-        self,
-        run: Run,
-        target: str,
-        models: str,
-        actor: LaplaceActor | AutoregressiveActor,
-        task_weights: Mapping[int, float] | None = None,
-    ) -> None:
+    def __init__(self, run: Run, target: str, models: str, actor: LaplaceActor | AutoregressiveActor) -> None:
         settings, size = run.config.post_train, run.config.post_train.group_size
         self._groups, self._read = settings.groups // processes.size(), [*actor.policy.in_keys, *_LEARNED_FROM]
         self._workers, seed = run.workers is not None, run.seed(target, another_draw(settings.draw, "env"))
@@ -69,8 +59,8 @@ class Waves:
         make: Callable[..., EnvBase]
         if settings.env == "imagined":
             self.imagination = Imagination.load(run, models)
-            self.env = self.imagination.env(run, [self._groups, size], seed=seed, task_weights=task_weights)
-            make = self.imagination.makes(run, size, seed=seed, task_weights=task_weights)
+            self.env = self.imagination.env(run, [self._groups, size], seed=seed)
+            make = self.imagination.makes(run, size, seed=seed)
             self.judges = {"world_model": self.imagination.world_model, "reflector": self.imagination.reflector}
             mine = self._groups
         elif processes.is_main():

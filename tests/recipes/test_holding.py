@@ -15,14 +15,11 @@ from adapt import adapt
 from checks import check_config, check_loop
 from config import GOAL_TASKS
 from holding import Hold, solved_shares
-from imagination import Imagination
-from parts import COMPACT
-from physics import exploring_actor, tabletop
+from physics import exploring_actor
 from post_train import post_train
 from run import Run
 from stages import plan
 from worldenv_trl import keys
-from worldenv_trl.reflectors import StopRule
 
 
 def episodes(tasks, successes):
@@ -106,30 +103,12 @@ def test_a_task_that_is_held_stays_and_one_that_is_not_is_learned_as_without(phy
     assert [line["held_groups"] for line in logged if "return" in line] == [0.0, 0.0]
 
 
-def test_held_tasks_have_no_more_than_their_share_of_imagined_groups(tiny, monkeypatch):
-    settings = dataclasses.replace(tiny.post_train, iterations=2, groups=4, probe_every=0, lora_rank=0, hold=1.0)
-    explored = dataclasses.replace(tiny.explore, scale_factors=(0.0,))
-    config = dataclasses.replace(tiny, tasks=GOAL_TASKS[1:], explore=explored, post_train=settings)
-    contexts = tabletop(config, "train", 6, None).reset()
-    parts = [getattr(COMPACT, name).make(config).eval() for name in ("world_model", "reflector")]
-    monkeypatch.setattr(Imagination, "load", lambda *_: Imagination(*parts, StopRule(), contexts))
-    monkeypatch.setattr(holding, "explored_at", lambda *_: episodes([0, 1], [0, 1]))
-    run = with_untrained_policy(config)
-    for share, expected in ((1.0, [0.5, 0.5]), (0.25, [0.25, 0.25])):
-        settings = dataclasses.replace(settings, held_share=share)
-        target = f"held_{share}"
-        post_train(dataclasses.replace(run, config=dataclasses.replace(config, post_train=settings)), "sft", target, "")
-        assert [line["held_groups"] for line in run.folder.read_metrics(target) if "return" in line] == expected
-
-
 def test_the_reference_is_what_the_source_does_at_held_decisions_alone(physics, monkeypatch, capsys):
     monkeypatch.setattr(holding, "explored_at", lambda *_: episodes([0, 1], [0, 1]))
     hold = Hold(dataclasses.replace(physics, config=dataclasses.replace(physics.config, tasks=GOAL_TASKS)), "sft", "")
     assert capsys.readouterr().out == f"held: {GOAL_TASKS[1]} (1.00)\n"
     wave = TensorDict({keys.TASK_ID: torch.tensor([0, 1]).view(2, 1, 1, 1).expand(2, 3, 4, 1)}, [2, 3, 4])
     assert hold.groups(wave).tolist() == [False, True]
-    assert hold.task_weights(1.0) == hold.task_weights(0.4) == {1: 1.0}  # it has a third of the groups
-    assert hold.task_weights(0.2) == {1: pytest.approx(0.5)}  # 1 of 5
     size = physics.config.image_size
     images = torch.randint(0, 255, (6, 3, size, size), dtype=torch.uint8)
     decisions = TensorDict({"observation": {"image": images, "state": torch.rand(6, 7)}}, [6])

@@ -64,7 +64,6 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
             "adapt.steps is of imagination: it must be 0 where post_train.env is tabletop, got 10",
         ),
         ({"post_train": PostTrain(env="tabletop"), "rounds": 2}, "rounds is of imagination: it must be 1 .* got 2"),
-        ({"post_train": PostTrain(env="tabletop", held_share=0.5)}, "held_share is of imagination: .* be 1 .* got 0.5"),
         (
             {"post_train": PostTrain(ratio_level="token")},
             "ratio_level must be step or chunk for OFTPolicy, which does not",

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -62,44 +61,24 @@ class ContextOrder:
 
     Args:
         contexts: TensorDict [K] with their task ids.
-        task_weights: by task id, how many groups begin at a task's contexts for one of a task that is not named. Passes
-            leave contexts of the lighter tasks out, others each time.
-
-    Raises:
-        ValueError: if a weight is not positive, or of a task that no context has.
     """
 
-    def __init__(self, contexts: TensorDictBase, task_weights: Mapping[int, float] | None = None) -> None:
+    def __init__(self, contexts: TensorDictBase) -> None:
         self._tasks = contexts[TASK_ID].flatten().tolist()
-        tasks, given = sorted(set(self._tasks)), dict(task_weights or {})
-        for task, weight in given.items():
-            if task not in tasks:
-                raise ValueError(f"task_weights names task {task}; the contexts are of tasks {tasks}")
-            if not (math.isfinite(weight) and weight > 0):
-                raise ValueError(f"the weight of task {task} must be positive, got {weight}")
-        weights = {task: given.get(task, 1.0) for task in tasks}
-        self._shares = {task: weight / max(weights.values()) for task, weight in weights.items()}
         self.seed(0)
 
     def seed(self, seed: int) -> None:
         self._generator = torch.Generator().manual_seed(seed)
         self._queue: list[int] = []
-        # Of each task what it may take part with, apart from one another: light tasks do not come all at once.
-        self._credit = {task: (n + 0.5) / len(self._shares) for n, task in enumerate(self._shares)}
 
     def state_dict(self) -> dict[str, Any]:
         """Where the draws are."""
-        return {
-            "generator": self._generator.get_state(),
-            "queue": list(self._queue),
-            "credit": dict(self._credit),
-        }
+        return {"generator": self._generator.get_state(), "queue": list(self._queue)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Draws on from there, of the same contexts."""
         self._generator.set_state(state_dict["generator"])
         self._queue = list(state_dict["queue"])
-        self._credit = dict(state_dict["credit"])
 
     def draw(self, count: int) -> list[int]:
         """Places in the contexts [K] of the next ``count`` groups: no context twice in a draw if it can be."""
@@ -108,12 +87,7 @@ class ContextOrder:
             if not self._queue:
                 order = self._order()
                 self._queue = [i for i in order if i not in drawn] + [i for i in order if i in drawn]
-            index = self._queue.pop(0)
-            task = self._tasks[index]
-            self._credit[task] += self._shares[task]
-            if self._credit[task] >= 1:
-                self._credit[task] -= 1
-                drawn.append(index)
+            drawn.append(self._queue.pop(0))
         return drawn
 
     def _order(self) -> list[int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -66,7 +65,6 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
         max_steps: env steps after which a rollout is truncated; need not be a multiple of the chunk.
         proprio: ``"commanded"`` writes the accumulated target pose as the state (the same number as in physics),
             ``"measured"`` the pose of the predicted joints.
-        task_weights: by task id, how many groups begin at a task's contexts for one of a task that is not named.
         seed: of the contexts' order and of the noise; drawn from torch's generator when None.
         device: of the specs and buffers; the contexts' when None. World model and kinematics must be there, too.
 
@@ -99,7 +97,6 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
         *,
         max_steps: int,
         proprio: str = "commanded",
-        task_weights: Mapping[int, float] | None = None,
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
@@ -120,7 +117,7 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
         self.max_steps, self.chunk_length, self.proprio = int(max_steps), world_model.chunk_length, proprio
         self._contexts = contexts.select(*context_keys(self.cameras)).to(device).contiguous()
         self._instructions = instructions_of(contexts)
-        self._order = ContextOrder(contexts, task_weights)
+        self._order = ContextOrder(contexts)
         specs = imagined_specs(batch, self.cameras, self.image_size, self.chunk_length, self._instructions[0], device)
         self.observation_spec, self.state_spec, self.action_spec, self.reward_spec, self.done_spec = specs
         self._make_buffers()
