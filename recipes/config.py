@@ -347,7 +347,7 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
         ),
     ),
     "improve": (
-        "Meant to raise held-out success (README: how far it does), in at most 60 minutes on 2 cores; extra vision.",
+        "Meant to raise held-out success (README: how far it does), in half an hour on 2 idle cores; extra vision.",
         _IMPROVE,
     ),
     "thorough": (

@@ -3,7 +3,7 @@
 From five demonstrations per task to a policy post-trained by reinforcement learning inside a learned world model::
 
     python recipes/world_env.py smoke      # every stage for real, at most 6 minutes on 2 cores
-    python recipes/world_env.py improve    # meant to raise held-out success: at most 60 minutes; extra vision
+    python recipes/world_env.py improve    # meant to raise held-out success: half an hour; extra vision
     python recipes/world_env.py real-size --real-size.policy FOLDER ...    # pretrained parts: recipes/README.md
     python recipes/world_env.py improve --help
     python recipes/world_env.py improve --dry-run [--gpus 8] [--gpu H100] [--matmul-share 0.3]    # its plan alone
