@@ -42,6 +42,8 @@ FREE = {
 }
 """Settings of the machine at hand, and where a run began: it may be continued with others. Only ``device`` and
 ``collectors`` (``local`` or shares, and how many) change noise and rounding."""
+_IDLE = {"explore.replay_shift_m": 0.08, "post_train.held_share": 1.0}
+"""Of settings that are gone: values at which they did nothing although they read as if they did."""
 
 
 class RunFolder:
@@ -339,9 +341,9 @@ def stored_settings(path: Path, kind: type) -> dict[str, Any]:
 
 
 def settings_gone(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Names of those in ``before`` that ``now`` does not have and that were not off (0, false, none or empty): what
-    they did is not done any more."""
-    return [name for name in before if name not in now and before[name]]
+    """Names of those in ``before`` that ``now`` does not have and that did something: they were not off (0, false, none
+    or empty), nor what :data:`_IDLE` names."""
+    return [name for name, value in before.items() if name not in now and value and value != _IDLE.get(name)]
 
 
 def _read(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:

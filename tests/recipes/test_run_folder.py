@@ -63,6 +63,13 @@ def test_a_setting_that_is_gone_and_was_on_is_refused_and_kept_by_name(config, f
     stored = folder.path / "config.yaml"
     stored.write_text(stored.read_text() + "mixed: 0\n")
     folder.open(config)  # it did nothing
+    idle = stored.read_text().replace("post_train:\n", "post_train:\n  held_share: 1.0\n")
+    stored.write_text(idle)
+    folder.open(config)  # nor did this at what was its default
+    stored.write_text(idle.replace("held_share: 1.0", "held_share: 0.25"))
+    with pytest.raises(ValueError, match=r"made with post_train.held_share=0.25, which is no setting any more"):
+        folder.open(config)
+    stored.write_text(idle.replace("  held_share: 1.0\n", ""))
     stored.write_text(stored.read_text() + "mixed: 0.5\n")
     with pytest.raises(ValueError, match=r"made with mixed=0.5, which is no setting any more: use another --run-dir"):
         folder.open(config)
