@@ -127,11 +127,10 @@ class Reflector:
     lr: float = 1e-3
     imagined_share: float = 0.5
     """Share of the training episodes that are imagined replays of recorded actions, labelled by the physics."""
-    path_steps: int = 0
-    """Steps of a second reflector, which judges in imagination by where the hand goes over the first frame; none when
-    0. Half as many come before, in which it finds the places that matter there. The first one then judges real frames
-    alone, and no imagined episodes are made for it. A batch is shared by the tasks: ten want three times what three
-    do."""
+    path_epochs: float = 0.0
+    """Passes over the rollouts for a second reflector, which judges in imagination by where the hand goes over the
+    first frame; none when 0. Half as many come before, in which it finds the places that matter there. The first one
+    then judges real frames alone, and no imagined episodes are made for it."""
     holdout: float = 0.2
     """Share of the exploration's initial states kept out, for the figures and for the choice of the stopping rule."""
     threshold: float = 0.5
@@ -327,7 +326,7 @@ _IMPROVE = WorldEnvConfig(
         vision_blocks=(2, 4, 10),
     ),
     explore=Explore(episodes_per_task=480),
-    reflector=Reflector(choose_threshold=True, path_steps=800),
+    reflector=Reflector(choose_threshold=True, path_epochs=20.0),
     adapt=Adapt(steps=500),
     post_train=PostTrain(iterations=36, lora_rank=0, lora_lr=1e-4, head_lr=1e-4, hold=1.0),
 )
@@ -351,14 +350,13 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
         _IMPROVE,
     ),
     "thorough": (
-        "`improve` for ten tasks: policy and judge of the path learn three times as long; about 4 hours; extra vision.",
+        "`improve` for ten tasks: the policy learns three times as long; about 4 hours; extra vision.",
         replace(
             _IMPROVE,
             run_dir=Path("runs/thorough"),
             tasks=GOAL_SUITE,
             max_steps=152,
             sft=replace(_IMPROVE.sft, steps=9000),
-            reflector=replace(_IMPROVE.reflector, path_steps=2400),
             evaluate=Evaluate(episodes_per_task=60),
         ),
     ),

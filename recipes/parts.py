@@ -125,7 +125,7 @@ def make_reflector(config: WorldEnvConfig) -> CompactReflector | DualReflector:
         lr=settings.lr,
     )
     reflector: CompactReflector | DualReflector = CompactReflector(video, lessons)
-    if settings.path_steps:
+    if settings.path_epochs:
         cameras = {
             name: views
             for name, views in cameras_of(config).items()
@@ -133,14 +133,14 @@ def make_reflector(config: WorldEnvConfig) -> CompactReflector | DualReflector:
         }
         if not cameras:
             raise ValueError(
-                "reflector.path_steps needs a camera that is fixed in the world, got cameras "
+                "reflector.path_epochs needs a camera that is fixed in the world, got cameras "
                 f"{', '.join(config.cameras)}: add agentview, or set it to 0"
             )
         path = PathReflectorConfig.for_cameras(cameras, image_size=config.image_size)
         reflector = DualReflector(
             DualReflectorConfig(video, path),
             lessons,
-            PathLessons(steps=settings.path_steps, place_steps=-(-settings.path_steps // 2), lr=settings.lr),
+            PathLessons(epochs=settings.path_epochs, place_epochs=settings.path_epochs / 2, lr=settings.lr),
         )
     if settings.vision_blocks:
         load_vision(reflector, config.vision_weights)

@@ -77,7 +77,7 @@ RANGES: dict[str, Range] = {
     "reflector.batch_size": _ONE,
     "reflector.lr": _RATE,
     "reflector.imagined_share": _SHARE,
-    "reflector.path_steps": _ZERO,
+    "reflector.path_epochs": _WEIGHT,
     "reflector.holdout": _SHARE,
     "adapt.steps": _ZERO,
     "adapt.episodes_per_task": _ONE,

@@ -17,7 +17,7 @@ Rows: the reflector on the real frames (its ceiling); one chunk ahead (real fram
 chunk); imagination; with ``--dreamt`` also other groups, from the same initial states, that the policy dreamt: what it
 does when it looks at imagined frames, as in LOOP, judged there and then lived in the physics (kept, too). The last
 table is r when real frames are shown to the first chunks only: when the truth is lost. A judge that looks at no video
-(``reflector.path_steps``) has no need of either: "imagined" is then what it says.
+(``reflector.path_epochs``) has no need of either: "imagined" is then what it says.
 """
 
 from __future__ import annotations

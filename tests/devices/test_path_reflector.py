@@ -27,7 +27,7 @@ def test_the_reflector_judges_there_as_here(gpu):
 
 
 def test_its_lessons_are_drawn_and_learned_there(gpu):
-    reflector, names = make(lessons=PathLessons(steps=1, place_steps=1, batch_size=8)).to(gpu), []
+    reflector, names = make(lessons=PathLessons(epochs=1, place_epochs=1, batch_size=8)).to(gpu), []
     for lesson in reflector.train_on(touching(8, 0)):
         batch = lesson.sample()
         assert all(value.device.type == "cuda" for value in batch.values())

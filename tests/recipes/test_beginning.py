@@ -25,7 +25,7 @@ WHOLE = dataclasses.replace(
     SMALL,
     max_steps=40,
     explore=config.Explore(episodes_per_task=8, num_envs=4, scale_factors=(0.0, 1.0)),
-    reflector=dataclasses.replace(SMALL.reflector, path_steps=2),
+    reflector=dataclasses.replace(SMALL.reflector, path_epochs=0.1),
     adapt=config.Adapt(steps=2, episodes_per_task=2, batch_size=2),
     post_train=dataclasses.replace(SMALL.post_train, iterations=2, hold=1.0),
 )

@@ -33,7 +33,7 @@ def run(tmp_path_factory) -> Run:
         max_steps=40,
         demonstrate=config.Demonstrate(episodes_per_task=4),
         explore=dataclasses.replace(SMALL.explore, episodes_per_task=4),
-        reflector=dataclasses.replace(SMALL.reflector, holdout=0.75, path_steps=1),
+        reflector=dataclasses.replace(SMALL.reflector, holdout=0.75, path_epochs=0.1),
     )
     run = open_run(settings)
     demonstrate(run)
@@ -124,7 +124,7 @@ def test_what_cannot_be_measured_is_refused(run):
 
 
 def test_a_judge_of_videos_is_refused(run, tmp_path):
-    video = dataclasses.replace(run.config, reflector=dataclasses.replace(run.config.reflector, path_steps=0))
+    video = dataclasses.replace(run.config, reflector=dataclasses.replace(run.config.reflector, path_epochs=0.0))
     make_reflector(video).save_pretrained(tmp_path / "video")
     module = benchmark("beside")
     with pytest.raises(SystemExit, match="looks at videos"):

@@ -90,7 +90,7 @@ def test_costs_of_the_compact_policy_are_what_torch_counts(tiny):
 
 
 def test_of_two_judges_the_one_of_imagination_is_counted_there_and_both_learn(tiny):
-    settings = dataclasses.replace(tiny, reflector=dataclasses.replace(tiny.reflector, path_steps=2))
+    settings = dataclasses.replace(tiny, reflector=dataclasses.replace(tiny.reflector, path_epochs=0.1))
     video, both = rehearse(tiny, COMPACT), rehearse(settings, COMPACT)
     assert not both.problems
     assert both.sizes["reflector"].parameters > video.sizes["reflector"].parameters

@@ -151,7 +151,7 @@ def test_the_command_leaves_its_figures(run, capsys):
 
 
 def test_nothing_is_imagined_for_a_judge_that_looks_at_no_video(run, monkeypatch):
-    by_path = dataclasses.replace(run.config.reflector, path_steps=1)
+    by_path = dataclasses.replace(run.config.reflector, path_epochs=0.1)
     shutil.rmtree(run.folder.checkpoint("reflector"))
     make_reflector(dataclasses.replace(run.config, reflector=by_path)).save_pretrained(
         run.folder.checkpoint("reflector")

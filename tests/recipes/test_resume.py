@@ -218,7 +218,7 @@ def test_an_earlier_stage_that_runs_again_takes_the_checkpoints_of_the_later_one
 def test_a_judge_of_paths_learns_without_imagined_episodes_continues_and_rewards_imagination(
     straight, tmp_path, monkeypatch, capsys
 ):
-    judged = dataclasses.replace(SETTINGS.reflector, path_steps=3)
+    judged = dataclasses.replace(SETTINGS.reflector, path_epochs=20.0)
     runs = [copy_of(straight, tmp_path / name, reflector=judged) for name in ("straight", "broken")]
     monkeypatch.delattr("imagining.imagine_episodes")
     rerun("train_reflector", WORKS["train_reflector"], runs[0])

@@ -26,7 +26,7 @@ def make(texts=TEXTS):
             PathReflectorConfig.for_cameras({"front": {text: FRONT for text in texts}}, image_size=SIZE),
         ),
         CompactLessons(encoder_steps=2, steps=2, batch_size=4),
-        PathLessons(steps=2, place_steps=2, batch_size=4),
+        PathLessons(epochs=1, place_epochs=1, batch_size=4),
     )
 
 

@@ -151,7 +151,7 @@ def touching(count, seed, texts=TEXTS):
 
 
 def test_it_learns_from_the_first_frame_and_the_path_whether_the_goal_is_reached():
-    lessons = PathLessons(steps=250, place_steps=20, batch_size=32)
+    lessons = PathLessons(epochs=31, place_epochs=2.5, batch_size=32)
     reflector = make(lessons=lessons, members=1, stride=1, window=0.4, crop_size=13)
     for lesson in reflector.train().train_on(touching(256, 0)):
         losses = work_through(reflector)(lesson)
@@ -169,7 +169,7 @@ def test_it_learns_from_the_first_frame_and_the_path_whether_the_goal_is_reached
 
 
 def test_the_loss_of_a_batch_is_the_mean_of_its_episodes():
-    reflector, episodes = make(lessons=PathLessons(steps=1, batch_size=8)), touching(8, 0)
+    reflector, episodes = make(lessons=PathLessons(epochs=1, batch_size=8)), touching(8, 0)
     assert 0 < episodes["success"].any(1).sum() < 8
     names = []
     for lesson in reflector.train_on(episodes):
@@ -183,7 +183,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_episodes():
 
 
 def test_a_training_that_is_begun_again_goes_on_from_the_places_that_it_had_found():
-    lessons = PathLessons(steps=1, place_steps=3, batch_size=8)
+    lessons = PathLessons(epochs=0.5, place_epochs=1.5, batch_size=8)
     one, other, episodes = make(lessons=lessons), make(lessons=lessons), touching(16, 0)
     straight, again = one.train_on(episodes), other.train_on(episodes)
     work_through(one)(next(straight))
@@ -197,10 +197,23 @@ def test_a_training_that_is_begun_again_goes_on_from_the_places_that_it_had_foun
     assert (drawn[0] == drawn[1]).all()
 
 
+@pytest.mark.parametrize(("count", "batch_size", "steps"), [(32, 8, [6, 10]), (64, 8, [12, 20]), (32, 9, [6, 10])])
+def test_it_learns_for_longer_where_there_is_more_to_learn_from(count, batch_size, steps):
+    lessons = PathLessons(epochs=2.5, place_epochs=1.5, batch_size=batch_size)
+    made = make(lessons=lessons).train_on(touching(count, 0))  # of two tasks: 9 are shared as 8
+    assert [lesson.steps for lesson in made] == steps
+
+
+@pytest.mark.parametrize("change", [{"epochs": 0.0}, {"place_epochs": float("inf")}, {"batch_size": 0}])
+def test_lessons_that_cannot_be_are_named(change):
+    with pytest.raises(ValueError, match=r"epochs and place_epochs must be above 0.*got .*" + str(*change.values())):
+        PathLessons(**change)
+
+
 def test_where_nothing_ever_succeeds_there_are_no_places_to_learn():
     episodes = touching(8, 0)
     episodes["success"] = torch.zeros_like(episodes["success"])
-    (lesson,) = make(lessons=PathLessons(steps=1, batch_size=8)).train_on(episodes)
+    (lesson,) = make(lessons=PathLessons(epochs=1, batch_size=8)).train_on(episodes)
     assert lesson.name == "paths" and not lesson.sample()["label"].any()
 
 
@@ -234,7 +247,7 @@ def test_an_env_shows_it_the_same_path_as_a_recording():
 
 
 def test_it_is_saved_with_its_cameras_and_what_it_learned(tmp_path):
-    lessons = PathLessons(steps=1, place_steps=1, batch_size=4)
+    lessons = PathLessons(epochs=0.5, place_epochs=0.5, batch_size=4)
     reflector, episodes = make(("front", "beside"), lessons=lessons), touching(8, 0)
     episodes = Videos(
         {"front": episodes.films["front"], "beside": episodes.films["front"]},

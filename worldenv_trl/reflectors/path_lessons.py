@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -30,12 +31,12 @@ _EPISODES_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class PathLessons:
-    """How long a :class:`PathReflector` learns.
+    """How long a :class:`PathReflector` learns, by how much there is to learn from.
 
     Args:
-        steps: batches of paths.
-        place_steps: batches of places, before.
-        batch_size: episodes in a batch.
+        epochs: times that it draws as many paths as there are episodes, in whole batches, one at least.
+        place_epochs: likewise of places, before.
+        batch_size: episodes in a batch, shared by the tasks.
         lr: the highest learning rate.
         weight_decay: of AdamW.
 
@@ -43,17 +44,17 @@ class PathLessons:
         ValueError: for numbers out of range.
     """
 
-    steps: int = 800
-    place_steps: int = 400
+    epochs: float = 20.0
+    place_epochs: float = 10.0
     batch_size: int = 48
     lr: float = 1e-3
     weight_decay: float = 0.05
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.place_steps, self.batch_size) < 1:
+        if not (0 < self.epochs < math.inf and 0 < self.place_epochs < math.inf) or self.batch_size < 1:
             raise ValueError(
-                "steps, place_steps and batch_size must be at least 1, "
-                f"got {self.steps}, {self.place_steps} and {self.batch_size}"
+                "epochs and place_epochs must be above 0 and batch_size at least 1, "
+                f"got {self.epochs}, {self.place_epochs} and {self.batch_size}"
             )
         if not self.lr > 0 or self.weight_decay < 0:
             raise ValueError(f"lr must be above 0 and weight_decay not below, got {self.lr} and {self.weight_decay}")
@@ -91,6 +92,9 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
         _by_task(number, chosen) for chosen in (reached.cpu(), torch.ones_like(number, dtype=torch.bool))
     )
 
+    def steps_of(epochs: float) -> int:
+        return math.ceil(epochs * len(episodes) / (_share(tasks, plan.batch_size) * len(tasks)))
+
     def sample_places() -> TensorDict:
         rows = _drawn(succeeded, plan.batch_size)
         here = rows.to(device)
@@ -107,7 +111,7 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
 
     if succeeded:
         finds = list(reflector.places.parameters())
-        yield Lesson("places", finds, sample_places, plan.place_steps, plan.lr, plan.weight_decay)
+        yield Lesson("places", finds, sample_places, steps_of(plan.place_epochs), plan.lr, plan.weight_decay)
 
     crops, points = [], []
     with torch.no_grad():
@@ -135,7 +139,7 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
         )
 
     judges = list(reflector.members.parameters())
-    yield Lesson("paths", judges, sample_paths, plan.steps, plan.lr, plan.weight_decay)
+    yield Lesson("paths", judges, sample_paths, steps_of(plan.epochs), plan.lr, plan.weight_decay)
 
 
 def _by_task(number: Tensor, chosen: Tensor) -> list[Tensor]:
@@ -146,8 +150,12 @@ def _by_task(number: Tensor, chosen: Tensor) -> list[Tensor]:
 
 def _drawn(pools: list[Tensor], count: int) -> Tensor:
     """About ``count`` rows, as many of each pool, at least one."""
-    share = max(1, count // len(pools))
-    return torch.cat([pool[torch.randint(len(pool), (share,))] for pool in pools])
+    return torch.cat([pool[torch.randint(len(pool), (_share(pools, count),))] for pool in pools])
+
+
+def _share(pools: list[Tensor], count: int) -> int:
+    """Rows of each pool among about ``count``."""
+    return max(1, count // len(pools))
 
 
 def _fit_statistics(reflector: PathReflector, poses: Tensor, weight: Tensor) -> None:
