@@ -315,7 +315,7 @@ class WorldEnvConfig:
 _IMPROVE = WorldEnvConfig(
     run_dir=Path("runs/improve"),
     train_states=150,
-    demonstrate=Demonstrate(states="spread"),
+    demonstrate=Demonstrate(episodes_per_task=2, states="spread"),
     sft=SFT(
         steps=3000,
         shift_px=0,
@@ -350,12 +350,13 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
         _IMPROVE,
     ),
     "thorough": (
-        "`improve` for ten tasks: the policy learns three times as long; about 4 hours; extra vision.",
+        "`improve` for ten tasks: five demonstrations, SFT three times as long; about 4 hours; extra vision.",
         replace(
             _IMPROVE,
             run_dir=Path("runs/thorough"),
             tasks=GOAL_SUITE,
             max_steps=152,
+            demonstrate=replace(_IMPROVE.demonstrate, episodes_per_task=5),
             sft=replace(_IMPROVE.sft, steps=9000),
             evaluate=Evaluate(episodes_per_task=60),
         ),

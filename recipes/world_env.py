@@ -1,6 +1,6 @@
 """The whole loop of World-Env (arXiv 2509.24948) in one command.
 
-From five demonstrations per task to a policy post-trained by reinforcement learning inside a learned world model::
+From a few demonstrations per task to a policy post-trained by reinforcement learning inside a learned world model::
 
     python recipes/world_env.py smoke      # every stage for real, at most 6 minutes on 2 cores
     python recipes/world_env.py improve    # meant to raise held-out success: half an hour; extra vision

@@ -190,7 +190,8 @@ def test_thorough_is_improve_on_a_suite_with_more_training():
     changed = {
         item.name for item in dataclasses.fields(improve) if getattr(improve, item.name) != getattr(thorough, item.name)
     }
-    assert changed == {"run_dir", "tasks", "max_steps", "sft", "evaluate"}
+    assert changed == {"run_dir", "tasks", "max_steps", "demonstrate", "sft", "evaluate"}
+    assert dataclasses.replace(thorough.demonstrate, episodes_per_task=2) == improve.demonstrate
     assert dataclasses.replace(thorough.sft, steps=improve.sft.steps) == improve.sft
     assert thorough.sft.steps == 3 * improve.sft.steps and len(thorough.tasks) == 10
     check_config(dataclasses.replace(thorough, sft=dataclasses.replace(thorough.sft, vision_blocks=())))
