@@ -17,6 +17,7 @@ from torch import Tensor
 from checks import check_loop
 from command_line import expected, in_options
 from config import WorldEnvConfig
+from explore import episodes_of_round
 from part_costs import Call, Size, counted, size
 from parts import PROPRIO, Parts, instructions
 from worldenv_trl import keys
@@ -272,8 +273,10 @@ def _judge(found: Rehearsal, config: WorldEnvConfig, made: dict[str, Any]) -> No
 
 
 def _lessons(reflector: Reflector, config: WorldEnvConfig) -> Call:
-    """A step of each lesson, times its steps, on episodes of noise."""
+    """A step of each lesson on episodes of noise, times the steps that it has on those of the run."""
     texts = instructions(config)
+    explored = episodes_of_round(config.explore, len(config.tasks))
+    taught = config.demonstrate.episodes_per_task * len(config.tasks) + (1 - config.reflector.holdout) * explored
     count, length = 4 * len(texts), config.max_steps + 1
     shown = TensorDict(
         {keys.frames_key(camera): _pixels(config, count * length) for camera in reflector.cameras},
@@ -295,7 +298,8 @@ def _lessons(reflector: Reflector, config: WorldEnvConfig) -> Call:
             reflector.training_loss(batch)["loss_reflector"].backward()
 
         step = counted(reflector, 1, learn, training=True)
-        flops, activations = flops + lesson.steps * step.flops, max(activations, step.activation_bytes)
+        steps = lesson.steps * (taught / count if lesson.by_epochs else 1)
+        flops, activations = flops + steps * step.flops, max(activations, step.activation_bytes)
     return Call(flops, activations)
 
 

@@ -89,6 +89,17 @@ def test_costs_of_the_compact_policy_are_what_torch_counts(tiny):
     assert found.sizes["sft"].trainable == found.sizes["sft"].parameters
 
 
+def test_a_judge_that_learns_by_epochs_learns_for_longer_from_more(tiny):
+    def planned(per_task, **settings):
+        explore = dataclasses.replace(tiny.explore, episodes_per_task=per_task, num_envs=8)
+        judge = dataclasses.replace(tiny.reflector, holdout=0.25, **settings)
+        return rehearse(dataclasses.replace(tiny, explore=explore, reflector=judge), COMPACT).calls["learn"].flops
+
+    # The demonstration and three quarters of the explored episodes, 20 times each; the video's judge learns as before
+    few, many = (planned(count, path_epochs=20.0) - planned(count) for count in (120, 480))
+    assert many / few == pytest.approx((1 + 360) / (1 + 90), rel=1e-6)
+
+
 def test_of_two_judges_the_one_of_imagination_is_counted_there_and_both_learn(tiny):
     settings = dataclasses.replace(tiny, reflector=dataclasses.replace(tiny.reflector, path_epochs=0.1))
     video, both = rehearse(tiny, COMPACT), rehearse(settings, COMPACT)

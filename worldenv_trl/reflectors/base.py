@@ -34,6 +34,8 @@ class Lesson:
     steps: int
     lr: float
     weight_decay: float = 0.0
+    by_epochs: bool = False
+    """Whether ``steps`` are passes over the episodes: of twice as many it would learn twice as long."""
 
 
 class Reflector(nn.Module, abc.ABC):

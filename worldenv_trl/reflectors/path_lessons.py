@@ -111,7 +111,8 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
 
     if succeeded:
         finds = list(reflector.places.parameters())
-        yield Lesson("places", finds, sample_places, steps_of(plan.place_epochs), plan.lr, plan.weight_decay)
+        steps = steps_of(plan.place_epochs)
+        yield Lesson("places", finds, sample_places, steps, plan.lr, plan.weight_decay, by_epochs=True)
 
     crops, points = [], []
     with torch.no_grad():
@@ -139,7 +140,7 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
         )
 
     judges = list(reflector.members.parameters())
-    yield Lesson("paths", judges, sample_paths, steps_of(plan.epochs), plan.lr, plan.weight_decay)
+    yield Lesson("paths", judges, sample_paths, steps_of(plan.epochs), plan.lr, plan.weight_decay, by_epochs=True)
 
 
 def _by_task(number: Tensor, chosen: Tensor) -> list[Tensor]:

@@ -92,7 +92,7 @@ def lessons_of(reflector: VLMReflector, episodes: Episodes) -> Iterator[Lesson]:
         reflector.requires_grad_(True).vlm.requires_grad_(False)
         head = list(reflector.head.parameters())
         steps = plan.epochs * math.ceil(len(weights) / plan.batch_size)
-        yield Lesson("head", head, batch, steps, plan.lr)
+        yield Lesson("head", head, batch, steps, plan.lr, by_epochs=True)
         if aside.any():
             reflector.head.requires_grad_(False)
             scaling = [reflector.log_scale, reflector.shift]
