@@ -167,21 +167,23 @@ class RunFolder:
         self._note_tasks(tasks or {})
 
     def check_settings(self, config: Any) -> None:
-        """Raises ``ValueError`` if a run was made here with other settings, naming the first of them."""
+        """Raises ``ValueError`` if a run was made here with other settings, naming the first of them: one that is
+        gone comes before those that could be set as they were."""
         if self.is_new:
             return
         before, now = stored_settings(self.path / "config.yaml", type(config)), settings_of(config)
+        for key in settings_gone(before, now):
+            raise ValueError(
+                f"{self.path} was made with {key}={before[key]!r}, which is no setting any more: use another "
+                f"--run-dir (--begin-from {self.path} takes over the stages before), or the versions in its "
+                "versions.json to continue"
+            )
         changed = [key for key in now if before.get(key) != now[key] and key not in FREE]
         if changed:
             key, more = changed[0], f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
             raise ValueError(
                 f"{self.path} was made with {key}={before.get(key)!r}, now {now[key]!r}{more}: "
                 "use another --run-dir, or the same settings to continue"
-            )
-        for key in settings_gone(before, now):
-            raise ValueError(
-                f"{self.path} was made with {key}={before[key]!r}, which is no setting any more: use another "
-                "--run-dir, or the versions in its versions.json to continue"
             )
 
     def _note_tasks(self, tasks: dict[str, str]) -> None:
