@@ -272,11 +272,20 @@ def _judge(found: Rehearsal, config: WorldEnvConfig, made: dict[str, Any]) -> No
     found.shapes.append(f"reflector: {_shape(next(iter(frames.values())))} -> scores {_shape(made['scores'])}")
 
 
+def explored(config: WorldEnvConfig) -> int:
+    """Episodes of a round of exploration."""
+    return episodes_of_round(config.explore, len(config.tasks))
+
+
+def taught(config: WorldEnvConfig) -> float:
+    """Real episodes that a round's reflector learns from: demonstrations and what of exploration is not kept out."""
+    demonstrated = config.demonstrate.episodes_per_task * len(config.tasks)
+    return demonstrated + (1 - config.reflector.holdout) * explored(config)
+
+
 def _lessons(reflector: Reflector, config: WorldEnvConfig) -> Call:
     """A step of each lesson on episodes of noise, times the steps that it has on those of the run."""
     texts = instructions(config)
-    explored = episodes_of_round(config.explore, len(config.tasks))
-    taught = config.demonstrate.episodes_per_task * len(config.tasks) + (1 - config.reflector.holdout) * explored
     count, length = 4 * len(texts), config.max_steps + 1
     shown = TensorDict(
         {keys.frames_key(camera): _pixels(config, count * length) for camera in reflector.cameras},
@@ -298,7 +307,7 @@ def _lessons(reflector: Reflector, config: WorldEnvConfig) -> Call:
             reflector.training_loss(batch)["loss_reflector"].backward()
 
         step = counted(reflector, 1, learn, training=True)
-        steps = lesson.steps * (taught / count if lesson.by_epochs else 1)
+        steps = lesson.steps * (taught(config) / count if lesson.by_epochs else 1)
         flops, activations = flops + steps * step.flops, max(activations, step.activation_bytes)
     return Call(flops, activations)
 

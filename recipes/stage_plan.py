@@ -6,10 +6,9 @@ import math
 from dataclasses import dataclass
 
 from config import WorldEnvConfig
-from explore import episodes_of_round
 from part_costs import Call, Size
 from probes import probed_iterations
-from rehearsal import Rehearsal
+from rehearsal import Rehearsal, explored, taught
 from stages import Stage, plan
 from updates import rows_at_once
 from worldenv_trl.reflectors import VLMLessons, VLMReflectorConfig
@@ -96,11 +95,6 @@ def decisions(config: WorldEnvConfig) -> int:
     return config.max_steps // config.chunk_length
 
 
-def explored(config: WorldEnvConfig) -> int:
-    """Episodes of a round of exploration."""
-    return episodes_of_round(config.explore, len(config.tasks))
-
-
 def iteration_flops(config: WorldEnvConfig, found: Rehearsal) -> float:
     """Of LOOP, rollouts and updates."""
     settings, calls = config.post_train, found.calls
@@ -139,8 +133,9 @@ def stage_flops(kind: str, config: WorldEnvConfig, found: Rehearsal, *, refit: b
         flops = painted * calls["imagine"].flops + 2 * kept * length * judged_flops(config, found)
         if "learn" in calls:
             return flops + calls["learn"].flops
-        taught = config.demonstrate.episodes_per_task * tasks + episodes - kept + imagined
-        return flops + taught * (config.max_steps * calls["see"].flops + _PREFIXES * calls["judge"].flops)
+        return flops + (taught(config) + imagined) * (
+            config.max_steps * calls["see"].flops + _PREFIXES * calls["judge"].flops
+        )
     if kind == "adapt":
         told = config.adapt
         shown = told.episodes_per_task * tasks * length * (calls["imagine"].flops + decide)

@@ -9,8 +9,8 @@ import pytest
 import config as settings
 from dry_run import too_large
 from part_costs import Call, Size
-from rehearsal import Rehearsal
-from stage_plan import Held, Machine, explored, iteration_flops, moved_bytes, stage_flops, stage_plans
+from rehearsal import Rehearsal, explored
+from stage_plan import Held, Machine, iteration_flops, moved_bytes, stage_flops, stage_plans
 
 GPUS = Machine("GPU", "cuda", gpus=4, flops=1000.0, memory=500.0, share=0.25)
 CONFIG = dataclasses.replace(

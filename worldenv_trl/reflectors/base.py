@@ -35,7 +35,7 @@ class Lesson:
     lr: float
     weight_decay: float = 0.0
     by_epochs: bool = False
-    """Whether ``steps`` are passes over the episodes: of twice as many it would learn twice as long."""
+    """Whether ``steps`` follow from the number of episodes: of twice as many it learns twice as long."""
 
 
 class Reflector(nn.Module, abc.ABC):

@@ -92,8 +92,8 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
         _by_task(number, chosen) for chosen in (reached.cpu(), torch.ones_like(number, dtype=torch.bool))
     )
 
-    def steps_of(epochs: float) -> int:
-        return math.ceil(epochs * len(episodes) / (_share(tasks, plan.batch_size) * len(tasks)))
+    def steps_of(epochs: float, pools: list[Tensor]) -> int:
+        return math.ceil(epochs * len(episodes) / (len(pools) * _share(pools, plan.batch_size)))
 
     def sample_places() -> TensorDict:
         rows = _drawn(succeeded, plan.batch_size)
@@ -111,7 +111,7 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
 
     if succeeded:
         finds = list(reflector.places.parameters())
-        steps = steps_of(plan.place_epochs)
+        steps = steps_of(plan.place_epochs, succeeded)
         yield Lesson("places", finds, sample_places, steps, plan.lr, plan.weight_decay, by_epochs=True)
 
     crops, points = [], []
@@ -140,7 +140,8 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
         )
 
     judges = list(reflector.members.parameters())
-    yield Lesson("paths", judges, sample_paths, steps_of(plan.epochs), plan.lr, plan.weight_decay, by_epochs=True)
+    steps = steps_of(plan.epochs, tasks)
+    yield Lesson("paths", judges, sample_paths, steps, plan.lr, plan.weight_decay, by_epochs=True)
 
 
 def _by_task(number: Tensor, chosen: Tensor) -> list[Tensor]:
