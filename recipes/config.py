@@ -121,16 +121,19 @@ class Reflector:
 
     vision_blocks: tuple[int, ...] = ()
     """Blocks of a frozen ImageNet encoder that it sees through, too, for instance 4 10."""
-    encoder_steps: int = 600
-    steps: int = 1000
+    encoder_frames: int = 6000
+    """Of each task and outcome, for its encoder."""
+    prefixes: int = 10000
+    """Likewise of videos' beginnings, for its head."""
     batch_size: int = 32
+    """Half the frames or beginnings in a batch."""
     lr: float = 1e-3
     imagined_share: float = 0.5
     """Share of the training episodes that are imagined replays of recorded actions, labelled by the physics."""
     path_epochs: float = 0.0
     """Passes over the rollouts for a second reflector, which judges in imagination by where the hand goes over the
-    first frame; none when 0. Half as many come before, in which it finds the places that matter there. The first one
-    then judges real frames alone, and no imagined episodes are made for it."""
+    first frame; none when 0. Half as many come before, in which it finds the places that matter there. In the world
+    both judge, and no imagined episodes are made for the first one."""
     holdout: float = 0.2
     """Share of the exploration's initial states kept out, for the figures and for the choice of the stopping rule."""
     threshold: float = 0.5
@@ -340,7 +343,7 @@ PRESETS: dict[str, tuple[str, WorldEnvConfig]] = {
             sft=SFT(steps=800, scale_steps=60),
             explore=Explore(episodes_per_task=24, num_envs=24),
             world_model=WorldModel(steps=160),
-            reflector=Reflector(encoder_steps=60, steps=80),
+            reflector=Reflector(encoder_frames=600, prefixes=800),
             post_train=PostTrain(iterations=2, groups=6, probe_every=1, probe_contexts=5),
             evaluate=Evaluate(episodes_per_task=20, num_envs=20),
         ),

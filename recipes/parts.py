@@ -119,8 +119,8 @@ def make_reflector(config: WorldEnvConfig) -> CompactReflector | DualReflector:
         vision_blocks=settings.vision_blocks,
     )
     lessons = CompactLessons(
-        encoder_steps=settings.encoder_steps,
-        steps=settings.steps,
+        encoder_frames=settings.encoder_frames,
+        prefixes=settings.prefixes,
         batch_size=settings.batch_size,
         lr=settings.lr,
     )

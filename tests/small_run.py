@@ -24,7 +24,7 @@ SMALL = dataclasses.replace(
     sft=config.SFT(steps=3, scale_steps=2),
     explore=config.Explore(episodes_per_task=8, num_envs=4, scale_factors=(1.0,)),
     world_model=config.WorldModel(steps=2, batch_size=2),
-    reflector=config.Reflector(encoder_steps=2, steps=2, batch_size=4),
+    reflector=config.Reflector(encoder_frames=16, prefixes=16, batch_size=4),
     post_train=config.PostTrain(iterations=1, groups=2, group_size=2, epochs=1, probe_contexts=2),
     evaluate=config.Evaluate(episodes_per_task=2, num_envs=2),
 )

@@ -85,7 +85,7 @@ def small(path: Path, settings: Benchmark) -> WorldEnvConfig:
         sft=SFT(steps=20, scale_steps=10, batch_size=8),
         explore=Explore(episodes_per_task=16, num_envs=4, scale_factors=(0.5, 2.0)),
         world_model=WorldModel(steps=10, batch_size=2),
-        reflector=Reflector(encoder_steps=8, steps=10, batch_size=4),
+        reflector=Reflector(encoder_frames=8, prefixes=10, batch_size=4),
         post_train=PostTrain(iterations=3, groups=2, group_size=2, epochs=2, probe_every=2, probe_contexts=2),
         evaluate=Evaluate(episodes_per_task=2, num_envs=2),
     )

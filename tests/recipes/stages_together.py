@@ -37,7 +37,7 @@ SETTINGS = dataclasses.replace(
     sft=config.SFT(steps=20, scale_steps=5, batch_size=8),
     explore=dataclasses.replace(SMALL.explore, scale_factors=(1.0, 0.0)),
     world_model=config.WorldModel(steps=20, batch_size=2, lr=5e-4),
-    reflector=config.Reflector(encoder_steps=20, steps=20, batch_size=4),
+    reflector=config.Reflector(encoder_frames=160, prefixes=160, batch_size=4),
     adapt=config.Adapt(steps=20, episodes_per_task=4, batch_size=8),
     post_train=config.PostTrain(
         iterations=5, groups=4, group_size=9, epochs=2, minibatch_size=36, probe_every=4, probe_contexts=2,

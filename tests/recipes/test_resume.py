@@ -30,7 +30,7 @@ SETTINGS = dataclasses.replace(
     checkpoint_minutes=1000.0,
     sft=config.SFT(steps=4, scale_steps=3, batch_size=8),
     world_model=config.WorldModel(steps=4, batch_size=2),
-    reflector=config.Reflector(encoder_steps=3, steps=3, batch_size=4),
+    reflector=config.Reflector(encoder_frames=24, prefixes=24, batch_size=4),
     adapt=config.Adapt(steps=4, episodes_per_task=4, batch_size=4),
     post_train=config.PostTrain(
         iterations=3,

@@ -20,7 +20,7 @@ def make(texts=SIDES, cameras=("agentview",), **lessons):
 
 
 def test_both_lessons_together_learn_what_each_of_two_goals_of_the_same_words_asks_for():
-    reflector, training = make(encoder_steps=100, steps=80), patches(64, SIDES)
+    reflector, training = make(encoder_frames=1600, prefixes=1280), patches(64, SIDES)
     teach = work_through(reflector)
     names = []
     for lesson in reflector.train_on(training):
@@ -34,7 +34,7 @@ def test_both_lessons_together_learn_what_each_of_two_goals_of_the_same_words_as
 
 
 def test_a_lesson_updates_its_own_part_only():
-    reflector, training = make(encoder_steps=2, steps=2), patches(8, SIDES)
+    reflector, training = make(encoder_frames=32, prefixes=32), patches(8, SIDES)
     before = {name: value.clone() for name, value in reflector.state_dict().items()}
     changed = []
     for lesson in reflector.train_on(training):
@@ -98,7 +98,7 @@ def test_two_cameras_are_trained_on():
         {"agentview": torch.zeros_like(one.films["agentview"]), "wrist": one.films["agentview"]},
         one.instructions, one["success"], one["task_id"].flatten().tolist(),
     )  # fmt: skip
-    reflector = make(cameras=("agentview", "wrist"), encoder_steps=60, steps=2, batch_size=16)
+    reflector = make(cameras=("agentview", "wrist"), encoder_frames=480, prefixes=16, batch_size=16)
     lesson = next(reflector.train_on(both))
     losses = work_through(reflector)(lesson)
     assert sum(losses[-10:]) < 0.6 * sum(losses[:10])  # the wrist alone shows it
@@ -119,6 +119,13 @@ def test_frames_are_drawn_evenly_over_tasks_and_outcomes_and_never_past_the_end(
         drawn = data["task_id"][row].squeeze(-1) == task
         assert int(drawn.sum()) == 2000
         assert int(data["success"][row, frame][drawn].sum()) == 1000
+
+
+@pytest.mark.parametrize(("tasks", "steps"), [(1, (5, 8)), (2, (10, 15)), (16, (80, 120)), (40, (80, 120))])
+def test_it_learns_as_much_of_each_of_many_tasks_as_of_a_few(tasks, steps):
+    episodes = labelled([10] * tasks, list(range(tasks)))  # of each a success and a failure in the same episode
+    lessons = make(["open"], encoder_frames=80, prefixes=120, batch_size=16).train_on(episodes)
+    assert tuple(lesson.steps for lesson in lessons) == steps
 
 
 def test_features_are_those_of_the_frames_and_zero_past_the_end():
@@ -158,7 +165,8 @@ def test_episodes_that_do_not_fit_are_refused_before_the_first_lesson(change, me
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"), [({"steps": 0}, "at least 1"), ({"lr": 0.0}, "lr must"), ({"label_smoothing": 1.0}, "1.0")]
+    ("settings", "message"),
+    [({"prefixes": 0}, "at least 1"), ({"lr": 0.0}, "lr must"), ({"label_smoothing": 1.0}, "1.0")],
 )
 def test_settings_out_of_range_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):

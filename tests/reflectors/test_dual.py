@@ -18,24 +18,56 @@ from worldenv_trl.reflectors import (
 )
 
 
-def make(texts=TEXTS):
+def make(texts=TEXTS, camera="front"):
     torch.manual_seed(0)
     return DualReflector(
         DualReflectorConfig(
-            CompactReflectorConfig(TEXTS, ("front",), image_size=SIZE, widths=(8, 12, 16)),
+            CompactReflectorConfig(TEXTS, (camera,), image_size=SIZE, widths=(8, 12, 16)),
             PathReflectorConfig.for_cameras({"front": {text: FRONT for text in texts}}, image_size=SIZE),
         ),
-        CompactLessons(encoder_steps=2, steps=2, batch_size=4),
+        CompactLessons(encoder_frames=8, prefixes=8, batch_size=4),
         PathLessons(epochs=1, place_epochs=1, batch_size=4),
     )
 
 
-def test_imagined_rollouts_are_judged_by_their_path_and_real_ones_by_what_they_show():
+def test_imagined_rollouts_are_judged_by_their_path_and_real_ones_by_what_they_show_too():
     reflector, episodes = make().eval(), touching(6, 0)
-    assert reflector.for_world("imagined") is reflector.path and reflector.for_world("real") is reflector.video
-    real, imagined = (score_episodes(reflector.for_world(world), episodes) for world in ("real", "imagined"))
-    assert torch.equal(score_episodes(reflector, episodes), real) and (real != imagined).any()
-    assert not reflector.for_world("imagined").reads_video and reflector.reads_video
+    assert reflector.for_world("imagined") is reflector.path and reflector.for_world("real") is reflector
+    assert not reflector.for_world("imagined").reads_video and reflector.reads_video and reflector.reads_path
+    seen, gone, real = (
+        score_episodes(judge, episodes).double() for judge in (reflector.video, reflector.path, reflector)
+    )
+    assert (seen != gone).any()
+    odds = (seen / (1 - seen) * gone / (1 - gone)).sqrt()
+    torch.testing.assert_close(real, odds / (1 + odds), rtol=1e-4, atol=1e-5)
+
+
+def test_who_is_sure_does_not_outvote_the_other():
+    reflector, episodes = make().eval(), touching(6, 0)
+    with torch.no_grad():
+        reflector.video.head[-1].bias.fill_(1e4)
+        for member in reflector.path.members:
+            member.head[-1].bias.fill_(-20.0)
+    scores = score_episodes(reflector, episodes)
+    assert (scores - 0.5).abs().max() < 1e-3
+
+
+def test_scores_are_the_same_in_whatever_pieces_frames_come():
+    reflector, episodes = make().eval(), touching(4, 0)
+    rows, last = torch.arange(4), episodes["actions"].shape[1]
+
+    def shown(steps):
+        frames = {"front": episodes.frames("front", rows.unsqueeze(-1), steps)}
+        return frames | {"kinematic_states": episodes["kinematic_states"][:, steps]}
+
+    first = {name: each[:, 0] for name, each in shown(torch.tensor([0])).items()}
+    state, scores = reflector.begin(first, episodes.instructions), []
+    for steps in torch.arange(1, last + 1).split(3):
+        before, copy = state, state.clone()
+        state, found = reflector.extend(before, shown(steps))
+        assert (before == copy).all() and torch.equal(state["score"], found[:, -1])
+        scores.append(found)
+    torch.testing.assert_close(torch.cat(scores, 1), score_episodes(reflector, episodes)[:, 1:], rtol=1e-4, atol=1e-5)
 
 
 def test_each_lesson_teaches_the_judge_that_it_is_for_and_no_other():
@@ -64,3 +96,8 @@ def test_both_are_saved_and_loaded_together(tmp_path):
 def test_judges_of_other_instructions_are_refused():
     with pytest.raises(ValueError, match="video and path must be for the same instructions"):
         make(texts=TEXTS[:1])
+
+
+def test_a_path_over_what_the_video_does_not_show_is_refused():
+    with pytest.raises(ValueError, match=r"path must look through cameras of video, \('side',\), got \('front',\)"):
+        make(camera="side")

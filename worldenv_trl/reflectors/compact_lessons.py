@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -29,12 +30,12 @@ _EPISODES_AT_ONCE = 16  # frames stay on disk until they are looked at
 
 @dataclass(frozen=True)
 class CompactLessons:
-    """How long a :class:`CompactReflector` learns.
+    """How long a :class:`CompactReflector` learns, by how many tasks there are.
 
     Args:
-        encoder_steps: of the first lesson, single frames.
-        steps: of the second, prefixes.
-        batch_size: half the frames or prefixes in a batch.
+        encoder_frames: of each task and outcome, drawn in whole batches for the first lesson, single frames.
+        prefixes: likewise for the second.
+        batch_size: half the frames or prefixes in a batch, shared by tasks and outcomes.
         lr: the highest learning rate, of either lesson.
         label_smoothing: labels of prefixes become ``s / 2`` and ``1 - s / 2``.
 
@@ -42,17 +43,17 @@ class CompactLessons:
         ValueError: for numbers out of range.
     """
 
-    encoder_steps: int = 600
-    steps: int = 1000
+    encoder_frames: int = 6000
+    prefixes: int = 10000
     batch_size: int = 32
     lr: float = 1e-3
     label_smoothing: float = 0.02
 
     def __post_init__(self) -> None:
-        if min(self.encoder_steps, self.steps, self.batch_size) < 1:
+        if min(self.encoder_frames, self.prefixes, self.batch_size) < 1:
             raise ValueError(
-                "encoder_steps, steps and batch_size must be at least 1, "
-                f"got {self.encoder_steps}, {self.steps} and {self.batch_size}"
+                "encoder_frames, prefixes and batch_size must be at least 1, "
+                f"got {self.encoder_frames}, {self.prefixes} and {self.batch_size}"
             )
         if not self.lr > 0 or not 0 <= self.label_smoothing < 1:
             raise ValueError(
@@ -93,10 +94,16 @@ def lessons_of(reflector: CompactReflector, episodes: Episodes) -> Iterator[Less
             out["lengths"] = used.unsqueeze(-1)
             return out
 
-        return Lesson("head", reflector.head_parameters(), prefixes, plan.steps, plan.lr, weight_decay=1e-2)
+        return Lesson(
+            "head", reflector.head_parameters(), prefixes, steps_of(plan.prefixes), plan.lr, weight_decay=1e-2
+        )
+
+    def steps_of(frames: int) -> int:
+        return math.ceil(frames / draw.share(2 * plan.batch_size))
 
     def both() -> Iterator[Lesson]:
-        yield Lesson("encoder", reflector.encoder_parameters(), frames, plan.encoder_steps, plan.lr, weight_decay=1e-3)
+        steps = steps_of(plan.encoder_frames)
+        yield Lesson("encoder", reflector.encoder_parameters(), frames, steps, plan.lr, weight_decay=1e-3)
         yield head()
 
     return both()
@@ -129,10 +136,13 @@ class FrameSampler:
         wanted = [(task == number) & alive & (success == label) for number in task.unique() for label in (True, False)]
         self.pools = [pool.nonzero() for pool in wanted if pool.any()]
 
+    def share(self, count: int) -> int:
+        """How many of ``count`` frames are of each task and outcome."""
+        return max(1, count // len(self.pools))
+
     def __call__(self, count: int) -> tuple[Tensor, Tensor]:
-        """Episode and frame of ``count`` frames, or a few less."""
-        share = max(1, count // len(self.pools))
-        drawn = torch.cat([pool[torch.randint(len(pool), (share,))] for pool in self.pools])  # [P, 2]
+        """Episode and frame of ``count`` frames, or a few less; more where there are more tasks and outcomes."""
+        drawn = torch.cat([pool[torch.randint(len(pool), (self.share(count),))] for pool in self.pools])  # [P, 2]
         return drawn[:, 0], drawn[:, 1]
 
 

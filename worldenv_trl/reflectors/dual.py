@@ -1,4 +1,4 @@
-"""One reflector for real frames, another for imagination."""
+"""A reflector of imagination that is asked in the world, too, beside one that looks at what happens there."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DualReflector", "DualReflectorConfig"]
 
+_NEVER_SURE = 1e-5  # a score of 1 would outvote any other
 _DEFAULT_VIDEO_LESSONS, _DEFAULT_PATH_LESSONS = CompactLessons(), PathLessons()
 
 
@@ -29,7 +30,8 @@ class DualReflectorConfig:
     """Of the two judges of a :class:`DualReflector`.
 
     Raises:
-        ValueError: if they are not for the same instructions.
+        ValueError: if they are not for the same instructions, or the path's looks through a camera that the video's
+            does not.
     """
 
     video: CompactReflectorConfig
@@ -41,6 +43,9 @@ class DualReflectorConfig:
                 "video and path must be for the same instructions, got "
                 f"{self.video.instructions} and {self.path.instructions}"
             )
+        others = [camera for camera in self.path.cameras if camera not in self.video.cameras]
+        if others:
+            raise ValueError(f"path must look through cameras of video, {self.video.cameras}, got {tuple(others)} too")
 
     @classmethod
     def from_dict(cls, fields: dict[str, Any]) -> DualReflectorConfig:
@@ -48,12 +53,12 @@ class DualReflectorConfig:
 
 
 class DualReflector(Reflector, Pretrained):
-    """A :class:`CompactReflector` that judges real frames and a :class:`PathReflector` that judges imagined rollouts.
+    """A :class:`PathReflector` judges imagined rollouts, it and a :class:`CompactReflector` those of the world.
 
-    Real frames show what happened, and whoever looks at them is right more often than any prediction. Imagined frames
-    show what the world model believes would have happened: inside a LOOP group that says less of the truth than the
-    commanded path over the real first frame. :meth:`for_world` gives the one or the other; where nobody asks, the
-    video is judged.
+    Imagined frames show what the world model believes would have happened: inside a LOOP group that says less of the
+    truth than the commanded path over the real first frame. Real frames show what happened; the path says where the
+    hand was when it did. They err in different places, and in the world R is the mean of both log-odds.
+    :meth:`for_world` gives the one or the other; where nobody asks, it is the world's.
 
     Args:
         config: of both.
@@ -69,20 +74,30 @@ class DualReflector(Reflector, Pretrained):
         path_lessons: PathLessons = _DEFAULT_PATH_LESSONS,
     ) -> None:
         super().__init__(
-            cameras=config.video.cameras, image_size=config.video.image_size, instructions=config.video.instructions
+            cameras=config.video.cameras,
+            image_size=config.video.image_size,
+            instructions=config.video.instructions,
+            reads_path=True,
         )
         self.config = config
         self.video = CompactReflector(config.video, video_lessons)
         self.path = PathReflector(config.path, path_lessons)
 
     def for_world(self, world: str) -> Reflector:
-        return self.path if world == "imagined" else self.video
+        return self.path if world == "imagined" else self
 
     def begin(self, frames: Mapping[str, Tensor], instructions: Sequence[str]) -> TensorDict:
-        return self.video.begin(frames, instructions)
+        shown = {camera: frames[camera] for camera in self.video.cameras if camera in frames}
+        states = {"video": self.video.begin(shown, instructions), "path": self.path.begin(frames, instructions)}
+        state = TensorDict(states, batch_size=[len(instructions)])
+        return state.set("score", _together(*(each["score"] for each in states.values())))
 
     def extend(self, state: TensorDictBase, frames: Mapping[str, Tensor]) -> tuple[TensorDict, Tensor]:
-        return self.video.extend(state, frames)
+        shown = {camera: frames[camera] for camera in self.video.cameras}
+        video, seen = self.video.extend(state["video"], shown)
+        path, gone = self.path.extend(state["path"], frames)
+        scores = _together(seen, gone)
+        return TensorDict({"video": video, "path": path, "score": scores[:, -1]}, batch_size=[len(scores)]), scores
 
     def train_on(self, episodes: Episodes) -> Iterator[Lesson]:
         """The lessons of the video's judge, then those of the path's.
@@ -97,3 +112,8 @@ class DualReflector(Reflector, Pretrained):
         """That of the judge whose lesson drew the batch."""
         of_path = not {"path", "place"}.isdisjoint(batch.keys())
         return (self.path if of_path else self.video).training_loss(batch)
+
+
+def _together(seen: Tensor, gone: Tensor) -> Tensor:
+    """The probability whose log-odds are the mean of those of two."""
+    return ((seen.logit(_NEVER_SURE) + gone.logit(_NEVER_SURE)) / 2).sigmoid()
