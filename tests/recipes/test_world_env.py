@@ -95,7 +95,7 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"sft": SFT(dim=126)}, "the policy cannot be made of these settings: dim must be a positive multiple"),
         ({"world_model": WorldModel(patch=8)}, "the world model cannot be made of these settings: patch must leave"),
         ({"world_model": WorldModel(denoise_steps=9)}, "num_denoise_steps must lie between 1 and 4, got 9"),
-        ({"reflector": Reflector(steps=0)}, "the reflector cannot be made of these settings: .*steps"),
+        ({"reflector": Reflector(prefixes=0)}, "the reflector cannot be made of these settings: .*prefixes"),
     ],
 )
 def test_bad_settings_fail_before_any_work_starts(change, message):
