@@ -122,11 +122,11 @@ class Reflector:
     vision_blocks: tuple[int, ...] = ()
     """Blocks of a frozen ImageNet encoder that it sees through, too, for instance 4 10."""
     encoder_frames: int = 6000
-    """Of each task and outcome, for its encoder."""
+    """Drawn of each task and outcome, for its encoder."""
     prefixes: int = 10000
-    """Likewise of videos' beginnings, for its head."""
+    """Likewise, of their videos, for its head."""
     batch_size: int = 32
-    """Half the frames or beginnings in a batch."""
+    """Half the frames or prefixes in a batch."""
     lr: float = 1e-3
     imagined_share: float = 0.5
     """Share of the training episodes that are imagined replays of recorded actions, labelled by the physics."""

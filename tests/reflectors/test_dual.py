@@ -70,6 +70,16 @@ def test_scores_are_the_same_in_whatever_pieces_frames_come():
     torch.testing.assert_close(torch.cat(scores, 1), score_episodes(reflector, episodes)[:, 1:], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("world", ["real", "imagined"])
+def test_of_an_instruction_that_neither_was_trained_on_there_is_one_warning(world):
+    judge, episodes = make().eval().for_world(world), touching(2, 0)
+    first = {"front": episodes.frames("front", torch.arange(2), torch.zeros(2, dtype=torch.int64))}
+    with pytest.warns(UserWarning, match="DualReflector was never trained on the instruction 'juggle'") as caught:
+        for _ in range(2):
+            judge.begin(first | {"kinematic_states": episodes["kinematic_states"][:, 0]}, ["juggle"] * 2)
+    assert len(caught) == 1
+
+
 def test_each_lesson_teaches_the_judge_that_it_is_for_and_no_other():
     reflector, changed = make(), []
     before = {name: value.clone() for name, value in reflector.state_dict().items()}

@@ -15,6 +15,7 @@ from torch import Tensor
 from worldenv_trl.devices import device_of
 from worldenv_trl.keys import TASK_ID, frames_key, image_entry
 from worldenv_trl.reflectors.base import Lesson
+from worldenv_trl.reflectors.pools import drawn, share
 
 if TYPE_CHECKING:
     from worldenv_trl.data import Episodes
@@ -99,7 +100,7 @@ def lessons_of(reflector: CompactReflector, episodes: Episodes) -> Iterator[Less
         )
 
     def steps_of(frames: int) -> int:
-        return math.ceil(frames / draw.share(2 * plan.batch_size))
+        return math.ceil(frames / share(draw.pools, 2 * plan.batch_size))
 
     def both() -> Iterator[Lesson]:
         steps = steps_of(plan.encoder_frames)
@@ -136,14 +137,10 @@ class FrameSampler:
         wanted = [(task == number) & alive & (success == label) for number in task.unique() for label in (True, False)]
         self.pools = [pool.nonzero() for pool in wanted if pool.any()]
 
-    def share(self, count: int) -> int:
-        """How many of ``count`` frames are of each task and outcome."""
-        return max(1, count // len(self.pools))
-
     def __call__(self, count: int) -> tuple[Tensor, Tensor]:
-        """Episode and frame of ``count`` frames, or a few less; more where there are more tasks and outcomes."""
-        drawn = torch.cat([pool[torch.randint(len(pool), (self.share(count),))] for pool in self.pools])  # [P, 2]
-        return drawn[:, 0], drawn[:, 1]
+        """Episode and frame of about ``count`` frames."""
+        row, frame = drawn(self.pools, count).unbind(1)
+        return row, frame
 
 
 def encode_all(reflector: CompactReflector, episodes: Episodes) -> Tensor:

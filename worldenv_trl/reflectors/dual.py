@@ -82,19 +82,18 @@ class DualReflector(Reflector, Pretrained):
         self.config = config
         self.video = CompactReflector(config.video, video_lessons)
         self.path = PathReflector(config.path, path_lessons)
+        self.video.seen = self.path.seen = self.seen  # of what neither was trained on there is one warning
 
     def for_world(self, world: str) -> Reflector:
         return self.path if world == "imagined" else self
 
     def begin(self, frames: Mapping[str, Tensor], instructions: Sequence[str]) -> TensorDict:
-        shown = {camera: frames[camera] for camera in self.video.cameras if camera in frames}
-        states = {"video": self.video.begin(shown, instructions), "path": self.path.begin(frames, instructions)}
+        states = {"video": self.video.begin(frames, instructions), "path": self.path.begin(frames, instructions)}
         state = TensorDict(states, batch_size=[len(instructions)])
         return state.set("score", _together(*(each["score"] for each in states.values())))
 
     def extend(self, state: TensorDictBase, frames: Mapping[str, Tensor]) -> tuple[TensorDict, Tensor]:
-        shown = {camera: frames[camera] for camera in self.video.cameras}
-        video, seen = self.video.extend(state["video"], shown)
+        video, seen = self.video.extend(state["video"], frames)
         path, gone = self.path.extend(state["path"], frames)
         scores = _together(seen, gone)
         return TensorDict({"video": video, "path": path, "score": scores[:, -1]}, batch_size=[len(scores)]), scores

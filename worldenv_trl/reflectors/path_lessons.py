@@ -16,6 +16,7 @@ from worldenv_trl.keys import TASK_ID
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.reflectors.base import Lesson
 from worldenv_trl.reflectors.places import offsets, places_of
+from worldenv_trl.reflectors.pools import drawn, share
 
 if TYPE_CHECKING:
     from worldenv_trl.data import Episodes
@@ -93,10 +94,10 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
     )
 
     def steps_of(epochs: float, pools: list[Tensor]) -> int:
-        return math.ceil(epochs * len(episodes) / (len(pools) * _share(pools, plan.batch_size)))
+        return math.ceil(epochs * len(episodes) / (len(pools) * share(pools, plan.batch_size)))
 
     def sample_places() -> TensorDict:
-        rows = _drawn(succeeded, plan.batch_size)
+        rows = drawn(succeeded, plan.batch_size)
         here = rows.to(device)
         return TensorDict(
             {
@@ -124,7 +125,7 @@ def _lessons(reflector: PathReflector, episodes: Episodes) -> Iterator[Lesson]:
     looks, moves, hands, there = torch.cat(crops), reflector.moves(poses), poses[..., :3], torch.cat(points)
 
     def sample_paths() -> TensorDict:
-        rows = _drawn(tasks, plan.batch_size).to(device)
+        rows = drawn(tasks, plan.batch_size).to(device)
         light = 1 + _LIGHT * torch.randn(len(rows), 1, 1, 1, 1, device=device)
         moved, beside = moves[rows], _BESIDE * torch.randn(len(rows), 1, 3, device=device)
         apart = offsets(hands[rows] + beside, there[rows])
@@ -148,16 +149,6 @@ def _by_task(number: Tensor, chosen: Tensor) -> list[Tensor]:
     """The chosen rows of each task that has some."""
     each = [((number == task) & chosen).nonzero().squeeze(-1) for task in number.unique()]
     return [rows for rows in each if len(rows)]
-
-
-def _drawn(pools: list[Tensor], count: int) -> Tensor:
-    """About ``count`` rows, as many of each pool, at least one."""
-    return torch.cat([pool[torch.randint(len(pool), (_share(pools, count),))] for pool in pools])
-
-
-def _share(pools: list[Tensor], count: int) -> int:
-    """Rows of each pool among about ``count``."""
-    return max(1, count // len(pools))
 
 
 def _fit_statistics(reflector: PathReflector, poses: Tensor, weight: Tensor) -> None:
