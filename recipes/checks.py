@@ -13,6 +13,7 @@ from ranges import check_ranges
 from worldenv_trl.data import ACTIONS
 from worldenv_trl.devices import choose_device
 from worldenv_trl.policies import Policy, TokenPolicy
+from worldenv_trl.policies.actor import NOISES
 from worldenv_trl.reflectors import StopRule
 from worldenv_trl.scenes import load_task
 
@@ -35,7 +36,7 @@ def check_shares(config: WorldEnvConfig, processes: int) -> None:
 
 
 def check_loop(config: WorldEnvConfig, policy: Policy) -> None:
-    """Raises ``ValueError`` for a ratio that the policy does not have, and if it has no mean to be kept."""
+    """Raises ``ValueError`` for a ratio that policy or noise does not have, and if it has no mean to be kept."""
     level = config.post_train.ratio_level
     if isinstance(policy, TokenPolicy) and policy.sequential and level == "step":
         raise ValueError(
@@ -46,6 +47,10 @@ def check_loop(config: WorldEnvConfig, policy: Policy) -> None:
         raise ValueError(
             f"post_train.ratio_level must be step or chunk for {type(policy).__name__}, which does not act by tokens, "
             "got 'token'"
+        )
+    if level == "chunk" and config.noise == "chunk" and not isinstance(policy, TokenPolicy):
+        raise ValueError(
+            "post_train.ratio_level must be step with noise='chunk', where each step has its chunk's ratio, got 'chunk'"
         )
     for name, value in (("post_train.hold", config.post_train.hold), ("adapt.steps", config.adapt.steps)):
         if isinstance(policy, TokenPolicy) and value:
@@ -74,6 +79,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     for name, value, known in (
         ("post_train.env", config.post_train.env, ("imagined", "tabletop")),
         ("post_train.ratio_level", config.post_train.ratio_level, ("step", "chunk", "token")),
+        ("noise", config.noise, tuple(NOISES)),
         ("parallel", config.parallel, MODES),
         ("demonstrate.actions", config.demonstrate.actions, ACTIONS),
         ("demonstrate.states", config.demonstrate.states, ("first", "spread")),

@@ -299,6 +299,10 @@ class WorldEnvConfig:
 
     Where they turn the hand, noise that suits rotations they never use is so small that the smallest update exceeds
     ``post_train.max_kl``."""
+    noise: str = "step"
+    """Of the Laplace density that explores, and that LOOP samples and scores: ``step``, each step's own (World-Env
+    Eq. 2), or ``chunk``, one displacement for all steps of a chunk, whose ratio each of them has
+    (``policies.ChunkLaplace``). Policies that act by tokens have none."""
     train_states: int = 50
     """Training initial states of each task that exploration starts from, and LOOP after it. 50 is the standard; another
     one costs a rollout of exploration, no demonstration."""

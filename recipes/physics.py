@@ -80,7 +80,9 @@ def exploring_actor(config: WorldEnvConfig, policy: Policy, scale_factor: float)
     """The stochastic actor of exploration and LOOP, a Laplace scale bounded below."""
     bounds = scale_bounds(policy, config.scale_floor, share=config.scale_share)
     events = 0 if config.post_train.ratio_level == "token" else 1
-    return policy_actor(policy, scale_factor=scale_factor, log_scale_bounds=bounds, event_dims=events)
+    return policy_actor(
+        policy, scale_factor=scale_factor, log_scale_bounds=bounds, event_dims=events, noise=config.noise
+    )
 
 
 def reached_goal(rollouts: TensorDictBase) -> torch.Tensor:

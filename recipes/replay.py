@@ -116,7 +116,8 @@ def recorded_actor(policy: Policy, settings: Mapping[str, Any]) -> LaplaceActor 
     if "scale_floor" not in settings:
         return policy_actor(policy)
     bounds = scale_bounds(policy, tuple(settings["scale_floor"]), share=settings["scale_share"])
-    return policy_actor(policy, scale_factor=settings["post_train"]["scale_factor"], log_scale_bounds=bounds)
+    factor, noise = settings["post_train"]["scale_factor"], settings.get("noise", "step")
+    return policy_actor(policy, scale_factor=factor, log_scale_bounds=bounds, noise=noise)
 
 
 def _checkpoint(part: Part[Kind], name: str | None, file: Path, metadata: dict, kind: str) -> Kind:

@@ -10,9 +10,10 @@ from torchrl.modules import ProbabilisticActor
 
 from worldenv_trl import keys
 from worldenv_trl.objectives import rloo_advantage
-from worldenv_trl.policies import IndependentLaplace
+from worldenv_trl.policies import ChunkLaplace, IndependentLaplace
 
 G, N, T, C, A, OBS = 2, 3, 3, 4, 7, 5
+_DENSITIES = {"step": IndependentLaplace, "chunk": ChunkLaplace}
 LENGTHS = [[9, 4, 12], [1, 6, 8]]  # executed steps: stops inside a chunk (9, 1, 6), at its end (4, 8), and never (12)
 
 
@@ -25,32 +26,36 @@ class Heads(nn.Module):
         return self.loc(features).unflatten(-1, (C, A)), self.beta(0.2 * features).unflatten(-1, (C, A)).exp()
 
 
-def make_actor(event_dims: int = 1, seed: int = 0) -> ProbabilisticActor:
+def make_actor(event_dims: int = 1, seed: int = 0, noise: str = "step") -> ProbabilisticActor:
     torch.manual_seed(seed)
-    return ProbabilisticActor(
+    actor = ProbabilisticActor(
         TensorDictModule(Heads().double(), in_keys=["features"], out_keys=[keys.LOC, keys.SCALE]),
         in_keys={"loc": keys.LOC, "scale": keys.SCALE},
         out_keys=[keys.CHUNK],
-        distribution_class=IndependentLaplace,
+        distribution_class=_DENSITIES[noise],
         distribution_kwargs={"event_dims": event_dims},
         return_log_prob=True,
         log_prob_key=keys.LOG_PROBS,
     )
+    actor.noise = noise
+    return actor
 
 
-def make_batch(event_dims: int = 1, spread: float = 0.15, seed: int = 8) -> TensorDict:
+def make_batch(event_dims: int = 1, spread: float = 0.15, seed: int = 8, noise: str = "step") -> TensorDict:
     """Ragged rollouts [G, N, T] as a rollout writes them: the root's step mask belongs to the decision before."""
-    actor, generator = make_actor(event_dims), torch.Generator().manual_seed(seed)
+    actor, generator = make_actor(event_dims, noise=noise), torch.Generator().manual_seed(seed)
     features = torch.randn(G, N, T, OBS, generator=generator, dtype=torch.float64)
     batch = TensorDict({"features": features}, [G, N, T])
     with torch.no_grad():
         loc, scale = actor.module[0].module(features)
-        noise = torch.rand(loc.shape, generator=generator, dtype=torch.float64) - 0.5
-        chunk = loc - scale * noise.sign() * torch.log1p(-2 * noise.abs())
-        log_probs = IndependentLaplace(loc, scale, event_dims).log_prob(chunk)
+        each = torch.rand(loc.shape, generator=generator, dtype=torch.float64) - 0.5
+        unit = -each.sign() * torch.log1p(-2 * each.abs())
+        density = _DENSITIES[noise](loc, scale, event_dims)
+        chunk = loc + (scale * unit if noise == "step" else density.shift_scale * unit[..., :1, :])
+        log_probs = density.log_prob(chunk)
     batch[keys.CHUNK] = chunk
     shift = spread * torch.randn(log_probs.shape, generator=generator, dtype=torch.float64)
-    batch[keys.LOG_PROBS] = log_probs + shift
+    batch[keys.LOG_PROBS] = log_probs + (shift if noise == "step" else shift[..., :1])
     steps = torch.arange(T * C).view(T, C) < torch.tensor(LENGTHS)[..., None, None]
     batch["next"] = TensorDict({keys.STEP_MASK: steps}, [G, N, T])
     batch[keys.STEP_MASK] = torch.cat([torch.zeros_like(steps[:, :, :1]), steps[:, :, :-1]], 2)

@@ -34,7 +34,14 @@ def reference(actor, batch, *, level="step", normalize="global", low=0.1, high=0
                     before = entry[keys.LOG_PROBS][c]
                     return density - before if before.ndim else density.sum() - before
 
-                if level == "chunk":
+                def shift_log_ratio(entry=entry, loc=loc, scale=scale):
+                    b = scale.mean(0) / math.sqrt(C)
+                    density = -(entry[keys.CHUNK] - loc).mean(0).abs() / b - torch.log(2 * b)
+                    return density.sum() - entry[keys.LOG_PROBS][0]
+
+                if level == "shift":
+                    ratios = [shift_log_ratio().exp()]
+                elif level == "chunk":
                     executed = min(C, LENGTHS[g][n] - decision * C)
                     ratios = [torch.exp(sum(log_ratio(c) for c in range(executed)))]
                 elif level == "dim":
@@ -84,6 +91,22 @@ def test_value_and_gradient_equal_the_equations(functional, level, normalize, cl
     expected = slow(actor, batch, level=level, normalize=normalize, low=low, high=high)
     assert max(gradient.abs().max() for gradient in expected[1]) > 1e-3
     assert_same(value_and_gradient(actor, loss, batch), expected)
+
+
+@pytest.mark.parametrize("functional", [True, False])
+def test_where_a_chunk_is_displaced_as_a_whole_each_executed_step_has_its_ratio(functional):
+    actor, batch = make_actor(noise="chunk"), make_batch(noise="chunk")
+    loss = LOOPLoss(actor, functional=functional)
+    expected = slow(actor, batch, level="shift")
+    assert max(gradient.abs().max() for gradient in expected[1]) > 1e-3
+    assert_same(value_and_gradient(actor, loss, batch), expected)
+    batch[keys.CHUNK][~batch[keys.MASK]] = math.nan
+    assert_same(value_and_gradient(actor, loss, batch), expected)
+
+
+def test_a_chunk_that_is_displaced_as_a_whole_has_one_ratio_already():
+    with pytest.raises(ValueError, match='use "step"'):
+        LOOPLoss(make_actor(noise="chunk"), ratio_level="chunk")
 
 
 def test_per_dimension_log_probs_also_serve_step_ratios():

@@ -100,6 +100,7 @@ def test_a_stage_reads_no_setting_that_could_change_unnoticed(whole):
         ({"sft__steps": 4}, "demonstrate"),
         ({"explore__episodes_per_task": 9}, "sft"),
         ({"scale_floor": (0.1, 0.1, 0.1)}, "sft"),
+        ({"noise": "chunk"}, "sft"),
         ({"world_model__steps": 3}, "explore"),
         ({"reflector__threshold": 0.6}, "world_model"),
         ({"adapt__steps": 3}, "reflector"),

@@ -69,6 +69,11 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
             "ratio_level must be step or chunk for OFTPolicy, which does not",
         ),
         ({"post_train": PostTrain(ratio_level="foo")}, "ratio_level must be one of step, chunk, token, got 'foo'"),
+        ({"noise": "pink"}, "noise must be one of step, chunk, got 'pink'"),
+        (
+            {"noise": "chunk", "post_train": PostTrain(ratio_level="chunk")},
+            "post_train.ratio_level must be step with noise='chunk', where each step has its chunk's ratio",
+        ),
         ({"post_train": PostTrain(group_size=1)}, "group_size must be at least 2"),
         ({"post_train": PostTrain(averaging=-0.1)}, "post_train.averaging must lie between 0 and 1, got -0.1"),
         ({"seed": -1}, "seed must be at least 0, got -1"),

@@ -6,6 +6,7 @@ from worldenv_trl.policies.actor import LaplaceActor, laplace_actor, likelihood_
 from worldenv_trl.policies.augmentation import random_shift
 from worldenv_trl.policies.autoregressive import AutoregressiveActor, TeacherForcing, token_cross_entropy
 from worldenv_trl.policies.base import Aims, Policy
+from worldenv_trl.policies.chunk_laplace import ChunkLaplace
 from worldenv_trl.policies.device_bridge import DeviceBridge
 from worldenv_trl.policies.external import ExternalConfig, ExternalPolicy
 from worldenv_trl.policies.fast import FASTConfig, FASTPolicy
@@ -28,6 +29,7 @@ from worldenv_trl.policies.token_policy import TokenPolicy
 __all__ = [
     "Aims",
     "AutoregressiveActor",
+    "ChunkLaplace",
     "DeviceBridge",
     "ExternalConfig",
     "ExternalPolicy",

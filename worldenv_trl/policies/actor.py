@@ -15,12 +15,14 @@ from torchrl.modules import ProbabilisticActor
 from worldenv_trl.keys import CHUNK, LOC, LOG_PROBS, LOG_SCALE, SCALE
 from worldenv_trl.policies.autoregressive import AutoregressiveActor
 from worldenv_trl.policies.base import Policy
+from worldenv_trl.policies.chunk_laplace import ChunkLaplace
 from worldenv_trl.policies.laplace import IndependentLaplace
 from worldenv_trl.policies.token_policy import TokenPolicy
 
 __all__ = ["LaplaceActor", "laplace_actor", "likelihood_actor", "policy_actor", "scale_bounds"]
 
 Bound = float | Sequence[float]
+NOISES = {"step": IndependentLaplace, "chunk": ChunkLaplace}
 
 
 class _Scale(nn.Module):
@@ -58,6 +60,11 @@ class LaplaceActor(ProbabilisticActor):
         """
         self.policy.require_gradients()
         return super().get_dist(*args, **kwargs)
+
+    @property
+    def noise(self) -> str:
+        """``step`` or ``chunk``: see :func:`laplace_actor`."""
+        return next(name for name, kind in NOISES.items() if kind is self[-1].distribution_class)
 
     @property
     def scale_factor(self) -> float:
@@ -118,6 +125,7 @@ def laplace_actor(
     event_dims: int = 1,
     scale_factor: float = 1.0,
     log_scale_bounds: tuple[Bound, Bound] | None = (-6.0, -1.5),
+    noise: str = "step",
     loc_key: NestedKey = LOC,
     scale_key: NestedKey = SCALE,
 ) -> LaplaceActor:
@@ -134,13 +142,16 @@ def laplace_actor(
         log_scale_bounds: where the log-scale is clamped: (low, high), each one number or one for each action
             dimension, or None. Its gradient is zero outside. The lower bound is what exploration lives on: see
             :func:`scale_bounds`.
+        noise: ``step``, each step of a chunk has its own (World-Env Eq. 2, :class:`IndependentLaplace`), or ``chunk``,
+            one for all of them (:class:`ChunkLaplace`).
         loc_key, scale_key: ``BCLoss`` takes the negative log-likelihood only of actors that write keys named plainly
             ``"loc"`` or ``"scale"`` (it falls back to squared errors of the mode, silently): for the scale-head stage
             use :func:`likelihood_actor`.
 
     Raises:
         TypeError: for what is not a policy, and for one that acts by tokens: see :func:`policy_actor`.
-        ValueError: for bounds of which the lower one is not below the upper one, or a factor that is not positive.
+        ValueError: for bounds of which the lower one is not below the upper one, a factor that is not positive, or
+            another ``noise``.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -156,6 +167,8 @@ def laplace_actor(
         raise TypeError(f"policy must be a worldenv_trl.policies.Policy, got {type(policy).__name__}")
     if isinstance(policy, TokenPolicy):
         raise TypeError(f"{type(policy).__name__} acts by tokens and has no Laplace density: use policy_actor")
+    if noise not in NOISES:
+        raise ValueError(f"noise must be one of {', '.join(NOISES)}, got {noise!r}")
     scale_factor = _positive(scale_factor)
     bounds = None
     if log_scale_bounds is not None:
@@ -171,7 +184,7 @@ def laplace_actor(
         module,
         in_keys={"loc": loc_key, "scale": scale_key},
         out_keys=[CHUNK],
-        distribution_class=IndependentLaplace,
+        distribution_class=NOISES[noise],
         distribution_kwargs={"event_dims": event_dims},
         return_log_prob=True,
         log_prob_key=LOG_PROBS,
@@ -184,6 +197,7 @@ def policy_actor(
     scale_factor: float = 1.0,
     log_scale_bounds: tuple[Bound, Bound] | None = (-6.0, -1.5),
     event_dims: int = 1,
+    noise: str = "step",
 ) -> LaplaceActor | AutoregressiveActor:
     """The stochastic actor of any policy: :func:`laplace_actor`, or :class:`AutoregressiveActor` of one that acts by
     tokens.
@@ -196,6 +210,7 @@ def policy_actor(
             temperature.
         log_scale_bounds: of the Laplace scale; without meaning for tokens.
         event_dims: of the log-probabilities, see both.
+        noise: of the Laplace density, see :func:`laplace_actor`; without meaning for tokens.
 
     Raises:
         TypeError: for what is not a policy.
@@ -204,7 +219,9 @@ def policy_actor(
     if isinstance(policy, TokenPolicy):
         temperature = policy.temperature * _positive(scale_factor)
         return AutoregressiveActor(policy, temperature=temperature, event_dims=event_dims)
-    return laplace_actor(policy, event_dims=event_dims, scale_factor=scale_factor, log_scale_bounds=log_scale_bounds)
+    return laplace_actor(
+        policy, event_dims=event_dims, scale_factor=scale_factor, log_scale_bounds=log_scale_bounds, noise=noise
+    )
 
 
 def likelihood_actor(policy: Policy) -> LaplaceActor:
