@@ -9,6 +9,7 @@ import pytest
 import torch
 from small_run import with_untrained_policy
 from tensordict import TensorDict
+from torch.testing import assert_close
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import probes
@@ -24,6 +25,7 @@ from worldenv_trl import keys
 from worldenv_trl.metrics import HonestyAlarm
 from worldenv_trl.objectives import LOOPLoss
 from worldenv_trl.policies import OFTConfig, OFTPolicy, laplace_actor
+from worldenv_trl.record import read_rollouts
 
 
 def test_the_first_and_the_last_iteration_are_probed():
@@ -66,6 +68,19 @@ def test_contexts_come_in_shuffled_passes(physics):
 
     post_train(physics, "sft", "post_train", "", returns_of=returns_of)
     assert sorted(drawn[0] + drawn[1]) == sorted(drawn[2] + drawn[3]) == [0, 1, 2, 3]
+
+
+def test_with_the_noise_of_chunks_every_step_of_a_chunk_is_displaced_alike_and_has_its_ratio(physics):
+    run = dataclasses.replace(physics, config=dataclasses.replace(physics.config, noise="chunk"))
+    post_train(run, "sft", "post_train", "", returns_of=lambda wave: wave[keys.CHUNK][..., 0].mean((-1, -2)))
+    first, last = (read_rollouts(run.folder.rollouts(f"post_train_{number:03d}")) for number in (0, 3))
+    for wave in (first, last):
+        executed, away = wave["next", keys.STEP_MASK], wave[keys.CHUNK] - wave[keys.LOC]
+        assert_close(away, away[..., :1, :].expand_as(away), rtol=0, atol=1e-5)
+        for name in (keys.LOG_PROBS, keys.RATIO):
+            alike = wave[name][..., :1].expand_as(wave[name])
+            assert_close(wave[name][executed], alike[executed], rtol=0, atol=1e-5)
+    assert (first[keys.RATIO][first["next", keys.STEP_MASK]] - 1).abs().max() > 1e-3
 
 
 def saved(run, decay, returns_of):

@@ -27,7 +27,7 @@ class ChunkLaplace(IndependentLaplace):
     What is scored is the mean of the chunk, as the sum of ``log Laplace(mean_t(a_t - loc_t); 0, b)`` over the action
     dimensions. The ratio of two policies is exact where they differ by the same shift at every step; what they differ
     by beside it is left out, like the rest of a chunk that was sampled whole and executed in part. World-Env draws each
-    step for itself (Eq. 2).
+    step for itself (Eq. 2); noise that stays the same over several steps is gSDE's idea (arXiv 2005.05719).
 
     Args:
         loc: ``[*B, C, A]``, mean, median and mode, in normalised action units.
