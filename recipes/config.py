@@ -192,8 +192,8 @@ class PostTrain:
     """
     warmup_iterations: int = 2
     max_kl: float = 0.1
-    """An iteration's updates stop when the approximate KL per step, or with the noise of chunks per chunk, exceeds this.
-    """
+    """An iteration's updates stop when the approximate KL per step exceeds this; per chunk where ``noise`` is of
+    chunks."""
     max_grad_norm: float = 1.0
     standardize: bool = True
     """Divide the advantages of a batch by their overall standard deviation (World-Env does not)."""
@@ -322,7 +322,6 @@ class WorldEnvConfig:
 
 _IMPROVE = WorldEnvConfig(
     run_dir=Path("runs/improve"),
-    noise="chunk",
     train_states=150,
     demonstrate=Demonstrate(episodes_per_task=2, states="spread"),
     sft=SFT(
@@ -337,7 +336,7 @@ _IMPROVE = WorldEnvConfig(
     explore=Explore(episodes_per_task=480),
     reflector=Reflector(choose_threshold=True, path_epochs=20.0),
     adapt=Adapt(steps=500),
-    post_train=PostTrain(iterations=36, lora_rank=0, lora_lr=1e-4, head_lr=1e-4, clip_epsilon=0.2, hold=1.0),
+    post_train=PostTrain(iterations=36, lora_rank=0, lora_lr=1e-4, head_lr=1e-4, hold=1.0),
 )
 
 

@@ -149,13 +149,14 @@ def test_foxglove_gets_a_layout_of_the_recording(run, tmp_path, capsys, monkeypa
     assert "Plot!action" in json.loads(target.read_text())["configById"]
 
 
-def test_a_sampled_what_if_has_the_noise_of_the_run_that_was_recorded():
+@pytest.mark.parametrize("noise", ["step", "chunk"])
+def test_a_sampled_what_if_has_the_noise_of_the_run_that_was_recorded(noise):
     policy = OFTPolicy(OFTConfig(("open the drawer",), image_size=32, dim=32))
     td = TensorDict(
         {"observation": {"image": torch.zeros(1, 3, 32, 32, dtype=torch.uint8), "state": torch.zeros(1, 7)}}
     )
     td = td.auto_batch_size_(1).set(keys.INSTRUCTION, "open the drawer")
-    config = PRESETS["improve"][1]
+    config = dataclasses.replace(PRESETS["improve"][1], noise=noise)
     exploring = exploring_actor(config, policy, config.post_train.scale_factor)
     recorded = replay_recipe.recorded_actor(policy, json.loads(json.dumps(dataclasses.asdict(config), default=str)))
     own = replay_recipe.recorded_actor(policy, {})
