@@ -25,9 +25,9 @@ class ChunkLaplace(IndependentLaplace):
     the hand ends and each gradient is noise, are neither sampled nor scored.
 
     What is scored is the mean of the chunk, as the sum of ``log Laplace(mean_t(a_t - loc_t); 0, b)`` over the action
-    dimensions. The ratio of two policies is exact where they differ by the same shift at every step; what they differ
-    by beside it is left out, like the rest of a chunk that was sampled whole and executed in part. World-Env draws each
-    step for itself (Eq. 2); noise that stays the same over several steps is gSDE's idea (arXiv 2005.05719).
+    dimensions. The ratio of two policies is exact where they differ by the same shift at every step; what else they
+    differ by is left out. A chunk counts whole, also one that was executed in part. World-Env draws each step by
+    itself (Eq. 2); noise that stays the same over several steps is gSDE's idea (arXiv 2005.05719).
 
     Args:
         loc: ``[*B, C, A]``, mean, median and mode, in normalised action units.
