@@ -28,7 +28,7 @@ class Heads(nn.Module):
 
 def make_actor(event_dims: int = 1, seed: int = 0, noise: str = "step") -> ProbabilisticActor:
     torch.manual_seed(seed)
-    actor = ProbabilisticActor(
+    return ProbabilisticActor(
         TensorDictModule(Heads().double(), in_keys=["features"], out_keys=[keys.LOC, keys.SCALE]),
         in_keys={"loc": keys.LOC, "scale": keys.SCALE},
         out_keys=[keys.CHUNK],
@@ -37,8 +37,6 @@ def make_actor(event_dims: int = 1, seed: int = 0, noise: str = "step") -> Proba
         return_log_prob=True,
         log_prob_key=keys.LOG_PROBS,
     )
-    actor.noise = noise
-    return actor
 
 
 def make_batch(event_dims: int = 1, spread: float = 0.15, seed: int = 8, noise: str = "step") -> TensorDict:
@@ -51,7 +49,7 @@ def make_batch(event_dims: int = 1, spread: float = 0.15, seed: int = 8, noise: 
         each = torch.rand(loc.shape, generator=generator, dtype=torch.float64) - 0.5
         unit = -each.sign() * torch.log1p(-2 * each.abs())
         density = _DENSITIES[noise](loc, scale, event_dims)
-        chunk = loc + (scale * unit if noise == "step" else density.shift_scale * unit[..., :1, :])
+        chunk = loc + density.noise_scale * (unit if noise == "step" else unit[..., :1, :])
         log_probs = density.log_prob(chunk)
     batch[keys.CHUNK] = chunk
     shift = spread * torch.randn(log_probs.shape, generator=generator, dtype=torch.float64)

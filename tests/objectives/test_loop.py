@@ -105,8 +105,9 @@ def test_where_a_chunk_is_displaced_as_a_whole_each_executed_step_has_its_ratio(
 
 
 def test_a_chunk_that_is_displaced_as_a_whole_has_one_ratio_already():
-    with pytest.raises(ValueError, match='use "step"'):
-        LOOPLoss(make_actor(noise="chunk"), ratio_level="chunk")
+    loss = LOOPLoss(make_actor(noise="chunk"), ratio_level="chunk")
+    with pytest.raises(ValueError, match='ChunkLaplace has that of the chunk at every step, use "step"'):
+        loss(make_batch(noise="chunk"))
 
 
 def test_per_dimension_log_probs_also_serve_step_ratios():

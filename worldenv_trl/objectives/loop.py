@@ -59,8 +59,8 @@ class LOOPLoss(LossModule):
     ``clip_fraction``, ``ESS`` (effective sample size as a share of the steps).
 
     Args:
-        actor: writes a distribution over chunks whose log-prob is [*B, C] (``event_dims=1``). With ``noise="chunk"``
-            each executed step has the ratio of its whole chunk.
+        actor: writes a distribution over chunks whose log-prob is [*B, C] (``event_dims=1``). One of whole
+            chunks (:class:`~worldenv_trl.policies.ChunkLaplace`) gives each executed step the ratio of its chunk.
 
     Keyword Args:
         clip_epsilon: ``epsilon``, or ``(low, high)``.
@@ -149,13 +149,6 @@ class LOOPLoss(LossModule):
         if not 0 <= reference_coef < math.inf:
             raise ValueError(f"reference_coef must be at least 0 and finite, got {reference_coef}")
         self._functional = functional
-        # Of a LaplaceActor whose chunks are displaced as a whole: also what was not executed says by how much.
-        self._shifted = getattr(actor, "noise", "step") == "chunk"
-        if self._shifted and ratio_level == "chunk":
-            raise ValueError(
-                'ratio_level="chunk" would take the ratio of a chunk once for each step: an actor with noise="chunk" '
-                'has that of the chunk at every step, use "step"'
-            )
         super().__init__()
         if functional:
             self.convert_to_functional(actor, "actor_network", create_target_params=False)
@@ -277,11 +270,17 @@ class LOOPLoss(LossModule):
 
         # Actions that were not executed must not reach the graph: 0 * NaN is NaN, also backwards.
         executed = steps.any(-1, keepdim=True) if whole else steps.unsqueeze(-1)
-        kept = executed.any(-2, keepdim=True) if self._shifted else executed
-        chunk = torch.where(kept, chunk, torch.zeros_like(chunk))  # tokens stay whole numbers
-        tensordict.set(names.action, chunk)  # an autoregressive actor reads them
+        taken = torch.where(executed, chunk, torch.zeros_like(chunk))  # tokens stay whole numbers
+        tensordict.set(names.action, taken)  # an autoregressive actor reads them
         distribution = self._distribution(tensordict)
-        now = distribution.log_prob(chunk)
+        if getattr(distribution, "whole_chunks", False):
+            if self.ratio_level == "chunk":
+                raise ValueError(
+                    f'ratio_level="chunk" would take the ratio of a chunk once for each step: '
+                    f'{type(distribution).__name__} has that of the chunk at every step, use "step"'
+                )
+            taken = torch.where(executed.any(-2, keepdim=True), chunk, torch.zeros_like(chunk))
+        now = distribution.log_prob(taken)
         if now.shape != before.shape:
             raise ValueError(
                 f"{names.sample_log_prob} is {list(before.shape)}, the actor scores {list(now.shape)}: "

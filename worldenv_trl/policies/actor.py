@@ -62,11 +62,6 @@ class LaplaceActor(ProbabilisticActor):
         return super().get_dist(*args, **kwargs)
 
     @property
-    def noise(self) -> str:
-        """``step`` or ``chunk``: see :func:`laplace_actor`."""
-        return next(name for name, kind in NOISES.items() if kind is self[-1].distribution_class)
-
-    @property
     def scale_factor(self) -> float:
         """What the learned scale is multiplied with, for sampling and for scoring alike."""
         return self._scale.scale_factor.item()

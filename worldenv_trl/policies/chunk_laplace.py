@@ -5,13 +5,8 @@ from __future__ import annotations
 import math
 
 import torch
-from torch.distributions import Laplace
-from torch.types import _size
 
 from worldenv_trl.policies.laplace import IndependentLaplace
-from worldenv_trl.row_share import own_rows
-
-_ONE = torch.Size()
 
 
 class ChunkLaplace(IndependentLaplace):
@@ -45,6 +40,8 @@ class ChunkLaplace(IndependentLaplace):
         (True, torch.Size([5, 8]))
     """
 
+    whole_chunks = True
+
     def __init__(
         self, loc: torch.Tensor, scale: torch.Tensor, event_dims: int = 1, validate_args: bool | None = False
     ) -> None:
@@ -53,35 +50,29 @@ class ChunkLaplace(IndependentLaplace):
                 f"need loc [*B, C, A] and event_dims 0, 1 or 2, got {list(loc.shape)} and event_dims={event_dims}"
             )
         super().__init__(loc, scale, event_dims, validate_args)
-        self._event_dims = event_dims
 
     @property
-    def shift_scale(self) -> torch.Tensor:
+    def noise_scale(self) -> torch.Tensor:
         """``b``, ``[*B, 1, A]``."""
         return self.scale.mean(-2, keepdim=True) / math.sqrt(self.scale.shape[-2])
 
     @property
     def variance(self) -> torch.Tensor:
-        return (2 * self.shift_scale.square()).expand_as(self.loc)
-
-    def rsample(self, sample_shape: _size = _ONE) -> torch.Tensor:
-        """See :meth:`IndependentLaplace.rsample`."""
-        scale = self.shift_scale
-        if sample_shape or scale.ndim == 2:
-            return self.loc + scale * Laplace(torch.zeros_like(scale), torch.ones_like(scale)).rsample(sample_shape)
-        unit = Laplace(torch.zeros_like(scale[:1]), torch.ones_like(scale[:1]))  # of one row
-        return self.loc + scale * own_rows(lambda count: unit.rsample(torch.Size([count])).squeeze(1), len(scale))
+        return (2 * self.noise_scale.square()).expand_as(self.loc)
 
     def log_prob(self, value: torch.Tensor) -> torch.Tensor:
-        shift = (value - self.loc).mean(-2, keepdim=True)
-        scale = self.shift_scale
+        """Of the mean of whole chunks ``[*S, *B, C, A]``, in the shape that ``event_dims`` says."""
+        shift, scale = (value - self.loc).mean(-2, keepdim=True), self.noise_scale
         return self._of_event(-shift.abs() / scale - (2 * scale).log())
 
     def entropy(self) -> torch.Tensor:
         """Of what is sampled, in the shape of :meth:`log_prob`."""
-        return self._of_event(1 + (2 * self.shift_scale).log())
+        return self._of_event(1 + (2 * self.noise_scale).log())
 
     def _of_event(self, each: torch.Tensor) -> torch.Tensor:
         """From ``[*S, *B, 1, A]`` to the shape that was asked for."""
+        dims = self.reinterpreted_batch_ndims
+        if dims == 2:
+            return each.sum((-2, -1))
         each = each.expand(*each.shape[:-2], *self.loc.shape[-2:])
-        return each if not self._event_dims else each.sum(-1) if self._event_dims == 1 else each[..., 0, :].sum(-1)
+        return each.sum(-1) if dims else each

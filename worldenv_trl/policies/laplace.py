@@ -29,6 +29,8 @@ class IndependentLaplace(Independent):
         torch.Size([5, 8])
     """
 
+    whole_chunks = False  # whether what is scored is the chunk as a whole, also where it was executed in part
+
     def __init__(
         self,
         loc: torch.Tensor,
@@ -46,11 +48,11 @@ class IndependentLaplace(Independent):
     def rsample(self, sample_shape: _size = _ONE) -> torch.Tensor:
         """Reparametrised samples ``[*sample_shape, *B, C, A]``; of rows shared by processes see
         :func:`~worldenv_trl.row_share.row_share`."""
-        loc, scale = self.base_dist.loc, self.base_dist.scale
+        loc, scale = self.loc, self.noise_scale
         if sample_shape or not loc.ndim:
-            return super().rsample(sample_shape)
-        unit = Laplace(torch.zeros_like(loc[:1]), torch.ones_like(loc[:1]))  # of one row
-        return loc + scale * own_rows(lambda count: unit.rsample(torch.Size([count])).squeeze(1), len(loc))
+            return loc + scale * Laplace(torch.zeros_like(scale), torch.ones_like(scale)).rsample(sample_shape)
+        unit = Laplace(torch.zeros_like(scale[:1]), torch.ones_like(scale[:1]))  # of one row
+        return loc + scale * own_rows(lambda count: unit.rsample(torch.Size([count])).squeeze(1), len(scale))
 
     @property
     def loc(self) -> torch.Tensor:
@@ -59,6 +61,11 @@ class IndependentLaplace(Independent):
     @property
     def scale(self) -> torch.Tensor:
         return self.base_dist.scale
+
+    @property
+    def noise_scale(self) -> torch.Tensor:
+        """Mean absolute deviation of what is drawn for a sample, broadcastable to ``loc``: here ``scale``."""
+        return self.scale
 
     @property
     def deterministic_sample(self) -> torch.Tensor:
