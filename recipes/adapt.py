@@ -5,6 +5,8 @@ what LOOP teaches it then is to see imagined frames, and not much about the task
 same actions from the same first frames, and the policy is distilled into itself: on both sorts of frames its means stay
 what they were on the real ones. It costs no rollout and reads no label.
 
+With ``adapt.correct_steps`` it is first taught where its hand has to go, by what exploration found (``correct.py``).
+
 Alone: ``python recipes/adapt.py improve --adapt.steps 500 --begin-from runs/improve --run-dir runs/adapted``.
 """
 
@@ -17,6 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 import processes
+from correct import correct
 from data_parallel import DataParallel, WholeOptimizer
 from episodes import explored_at, round_of
 from holding import all_held
@@ -47,16 +50,17 @@ def adapt(run: Run, source: str = "sft", target: str = "adapted", models: str = 
         if processes.is_main():
             policy.save_pretrained(run.folder.checkpoint(target))
         return
+    moved = [each for group in policy.post_training_parameters(config.post_train.lora_rank).values() for each in group]
+    correct(run, policy, moved, models)
     explored = sampled_as_in_loop(run, round_of(models))
     with run.folder.lasting_scratch() as scratch:
         dreamt = imagined(run, run.world_model(models), explored, target, "explored", scratch)
         decisions = Decisions(explored, dreamt, policy, config.chunk_length)
         decisions.refer(exploring_actor(config, policy, 1.0))
-        moved = policy.post_training_parameters(config.post_train.lora_rank)
         learner = DataParallel(
             policy, lambda part: DistillationLoss(exploring_actor(config, part, 1.0)), config.parallel
         )
-        parameters = learner.trained([parameter for group in moved.values() for parameter in group])
+        parameters = learner.trained(moved)
         optimizer = torch.optim.AdamW(parameters, lr=settings.lr, weight_decay=0.0)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, settings.lr, total_steps=settings.steps)
         parts: dict[str, Any] = {"policy": learner, "optimizer": WholeOptimizer(optimizer), "schedule": schedule}

@@ -121,6 +121,17 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             "post_train.hold asks what greedy rollouts solved: explore.scale_factors must hold 0, got "
             f"{', '.join(f'{factor:g}' for factor in config.explore.scale_factors)}"
         )
+    if config.adapt.correct_steps:
+        if not config.adapt.steps:
+            raise ValueError(
+                f"adapt.correct_steps is a part of adapting: adapt.steps must be at least 1 with it, or it 0, got "
+                f"{config.adapt.correct_steps} with adapt.steps 0"
+            )
+        if 0.0 not in config.explore.scale_factors:
+            raise ValueError(
+                "adapt.correct_steps keeps what greedy rollouts do: explore.scale_factors must hold 0, got "
+                f"{', '.join(f'{factor:g}' for factor in config.explore.scale_factors)}"
+            )
     if config.post_train.env == "tabletop":
         for name, count, least in (("adapt.steps", config.adapt.steps, 0), ("rounds", config.rounds, 1)):
             if count > least:

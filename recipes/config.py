@@ -153,6 +153,10 @@ class Adapt:
     batch_size: int = 48
     """Decisions, each seen both ways."""
     lr: float = 1e-4
+    correct_steps: int = 0
+    """First the policy is taught where the hand has to go in the explored initial states (``correct.py``); 0 does not.
+    """
+    correct_lr: float = 5e-4
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,8 @@ RANGES: dict[str, Range] = {
     "adapt.episodes_per_task": _ONE,
     "adapt.batch_size": _ONE,
     "adapt.lr": _RATE,
+    "adapt.correct_steps": _ZERO,
+    "adapt.correct_lr": _RATE,
     "post_train.iterations": _ONE,
     "post_train.groups": _ONE,
     "post_train.group_size": Range(2),

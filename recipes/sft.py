@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -77,7 +77,8 @@ def _clone_tokens(policy: TokenPolicy, samples: TensorDictBase, run: Run) -> Non
         actor = TeacherForcing(part)
         return _behaviour_cloning(actor, keys.TOKENS, padding, loss_function=token_cross_entropy)
 
-    _train(policy, cross_entropy, samples, learning, settings.steps, settings.lr, run, "cross_entropy", padding)
+    shown = Demonstrated(samples, run)
+    train(policy, cross_entropy, shown, learning, settings.steps, settings.lr, run, "cross_entropy", padding)
 
 
 def _clone_chunks(policy: Policy, samples: TensorDictBase, run: Run) -> None:
@@ -86,18 +87,8 @@ def _clone_chunks(policy: Policy, samples: TensorDictBase, run: Run) -> None:
     learning = [parameter for parameter in policy.parameters() if parameter.requires_grad]
     others = [parameter for parameter in learning if all(parameter is not each for each in scale)]
 
-    aims = settings.aim_weight > 0 and isinstance(policy, Aims)
-    if settings.aim_weight > 0 and not aims:
-        warnings.warn(
-            f"{type(policy).__name__} does not say where it aims: it learns actions alone, without sft.aim_weight",
-            stacklevel=2,
-        )
-
-    def l1(part: Policy) -> torch.nn.Module:
-        loss = _behaviour_cloning(laplace_actor(part), loss_function="l1")
-        return AimedCloning(loss, part, _seen(run), settings.aim_weight) if aims else loss
-
-    _train(policy, l1, samples, others, settings.steps, settings.lr, run, "l1")
+    shown = Demonstrated(samples, run)
+    train(policy, cloning(policy, run), shown, others, settings.steps, settings.lr, run, "l1")
 
     # Only the scale moves from here on (World-Env section 4.1).
     policy.requires_grad_(False)
@@ -107,7 +98,24 @@ def _clone_chunks(policy: Policy, samples: TensorDictBase, run: Run) -> None:
     def nll(part: Policy) -> BCLoss:
         return _behaviour_cloning(likelihood_actor(part))
 
-    _train(policy, nll, samples, scale, settings.scale_steps, settings.scale_lr, run, "nll")
+    train(policy, nll, shown, scale, settings.scale_steps, settings.scale_lr, run, "nll")
+
+
+def cloning(policy: Policy, run: Run) -> Callable[[Policy], torch.nn.Module]:
+    """What makes the loss that means are taught by: L1, and where the policy aims if it says so."""
+    weight = run.config.sft.aim_weight
+    aims = weight > 0 and isinstance(policy, Aims)
+    if weight > 0 and not aims:
+        warnings.warn(
+            f"{type(policy).__name__} does not say where it aims: it learns actions alone, without sft.aim_weight",
+            stacklevel=2,
+        )
+
+    def l1(part: Policy) -> torch.nn.Module:
+        loss = _behaviour_cloning(laplace_actor(part), loss_function="l1")
+        return AimedCloning(loss, part, _seen(run), weight) if aims else loss
+
+    return l1
 
 
 def _behaviour_cloning(
@@ -129,34 +137,69 @@ def _seen(run: Run) -> dict[str, dict[str, Camera]]:
     return {name: views for name, views in cameras_of(run.config).items() if name in seen}
 
 
-def _lowest(samples: TensorDictBase) -> dict[str, float]:
-    """The hand's lowest height (m) in the demonstrations of each instruction: where it takes hold of things."""
-    lowest: dict[str, float] = {}
-    for text, height in zip(instructions_of(samples), samples[keys.STATE][:, 2].tolist(), strict=True):
-        lowest[text] = min(height, lowest.get(text, height))
-    return lowest
+class Lessons(Protocol):
+    """Samples to imitate, and which of them a batch is made of."""
+
+    @property
+    def lowest(self) -> dict[str, float]:
+        """The hand's lowest height (m) in the demonstrations of each instruction: where it takes hold of things."""
+
+    def draw(self, count: int) -> torch.Tensor:
+        """int64 [count]: numbers of samples for a batch."""
+
+    def __getitem__(self, rows: torch.Tensor) -> TensorDictBase:
+        """The samples of these numbers, with what :func:`~worldenv_trl.data.policy_samples` tells of each."""
 
 
-def _draws(samples: TensorDictBase, chunk_length: int, share: float) -> Callable[[int], torch.Tensor]:
-    """What draws numbers of samples for a batch: ``share`` of them from where whole chunks begin, else from all."""
-    if share == 0:
-        return lambda count: torch.randint(len(samples), (count,))
+class Demonstrated:
+    """Samples [N] of demonstrations, ``sft.decision_share`` of a batch from where whole chunks begin."""
+
+    def __init__(self, samples: TensorDictBase, run: Run) -> None:
+        self._samples, share = samples, run.config.sft.decision_share
+        self._weights = decision_weights(samples, run.config.chunk_length, share) if share else None
+
+    @property
+    def lowest(self) -> dict[str, float]:
+        return lowest_heights(instructions_of(self._samples), self._samples[keys.STATE])
+
+    def draw(self, count: int) -> torch.Tensor:
+        if self._weights is None:
+            return torch.randint(len(self._samples), (count,))
+        return torch.multinomial(self._weights, count, replacement=True)
+
+    def __getitem__(self, rows: torch.Tensor) -> TensorDictBase:
+        return self._samples[rows]
+
+
+def lowest_heights(texts: Sequence[str], states: torch.Tensor) -> dict[str, float]:
+    """See :class:`Lessons`; of instructions and states [N, 7]."""
+    found: dict[str, float] = {}
+    for text, height in zip(texts, states[:, 2].tolist(), strict=True):
+        found[text] = min(height, found.get(text, height))
+    return found
+
+
+def decision_weights(samples: TensorDictBase, chunk_length: int, share: float) -> torch.Tensor:
+    """How likely each of the samples [N] is drawn, summing to one: ``share`` for those where whole chunks begin."""
     decides = samples[keys.NUM_STEPS].squeeze(-1) % chunk_length == 0
-    weights = share * decides / decides.sum() + (1 - share) / len(samples)
-    return lambda count: torch.multinomial(weights, count, replacement=True)
+    share = share if decides.any() else 0.0
+    return share * decides / decides.sum().clamp_min(1) + (1 - share) / len(samples)
 
 
-def _train(
+def train(
     policy: Policy,
     make_loss: Callable[[Any], torch.nn.Module],
-    samples: TensorDictBase,
+    lessons: Lessons,
     parameters: list[torch.nn.Parameter],
     steps: int,
     lr: float,
     run: Run,
     name: str,
     padding: NestedKey = keys.ACTION_IS_PAD,
+    stage: str = "sft",
 ) -> None:
+    """``steps`` updates of ``parameters`` by batches of ``sft.batch_size`` lessons, moved as SFT's settings say; logged
+    as ``stage``, continued under ``name``."""
     settings, learner = run.config.sft, DataParallel(policy, make_loss, run.config.parallel)
     parameters, rows = learner.trained(parameters), settings.batch_size // processes.size()
     images = [keys.image_key(camera) for camera in settings.cameras or run.config.cameras]
@@ -164,17 +207,16 @@ def _train(
     if settings.place_shift_m:
         shifts.append(PlaceShift(_seen(run), settings.place_shift_m))
     if settings.scene_shift_m:
-        shifts.append(SceneShift(_seen(run), settings.scene_shift_m, height=_lowest(samples)))
-    draw = _draws(samples, run.config.chunk_length, settings.decision_share)
+        shifts.append(SceneShift(_seen(run), settings.scene_shift_m, height=lessons.lowest))
     optimizer = torch.optim.AdamW(parameters, lr=lr, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
     )
     state: dict[str, Any] = {"policy": learner, "optimizer": WholeOptimizer(optimizer), "schedule": schedule}
-    progress = Resumable(run, name, steps, **state).bar(f"sft {name}")
+    progress = Resumable(run, name, steps, **state).bar(f"{stage} {name}")
     for step in progress:
         with processes.sharing():
-            batch = to_device(samples[own_rows(draw, rows)], run.device)
+            batch = to_device(lessons[own_rows(lessons.draw, rows)], run.device)
             for shift in shifts:
                 batch = shift(batch)
             for image in images:
@@ -189,7 +231,7 @@ def _train(
             logged = {name: value.item()}
             if "loss_aim" in out:  # of the main process's rows
                 logged = {name: out["loss_bc"].item(), "aim": out["loss_aim"].item()}
-            run.folder.log("sft", step=step, **logged)
+            run.folder.log(stage, step=step, **logged)
             progress.set_postfix(loss=f"{value.item():.4f}")
     learner.close()
 

@@ -139,7 +139,8 @@ def stage_flops(kind: str, config: WorldEnvConfig, found: Rehearsal, *, refit: b
     if kind == "adapt":
         told = config.adapt
         shown = told.episodes_per_task * tasks * length * (calls["imagine"].flops + decide)
-        return shown + 2 * told.steps * told.batch_size * calls["update"].flops
+        taught_again = told.correct_steps * config.sft.batch_size * calls["update"].flops
+        return shown + taught_again + 2 * told.steps * told.batch_size * calls["update"].flops
     if kind == "post_train":
         settings = config.post_train
         looked = settings.probe_contexts * tasks * length
@@ -190,7 +191,8 @@ def _memory(kind: str, config: WorldEnvConfig, found: Rehearsal, machine: Machin
         held = [Held(sizes["world_model"]), Held(sizes["reflector"], learns=True)]
         return held, max(learning, imagined(min(found.rows_imagined, rows(explored(config)))))
     if kind == "adapt":
-        batch = 2 * rows(config.adapt.batch_size) * calls["update"].activation_bytes
+        corrected = rows(config.sft.batch_size) if config.adapt.correct_steps else 0
+        batch = max(2 * rows(config.adapt.batch_size), corrected) * calls["update"].activation_bytes
         painting = found.rows_imagined * calls["imagine"].activation_bytes
         return [Held(sizes["policy"], learns=True), Held(sizes["world_model"])], max(batch, painting)
     if kind == "post_train":

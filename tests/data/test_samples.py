@@ -5,7 +5,7 @@ import torch
 from small_rollouts import make_episodes
 
 from worldenv_trl import keys
-from worldenv_trl.data import policy_samples
+from worldenv_trl.data import policy_samples, with_images
 from worldenv_trl.language import instructions_of
 
 
@@ -90,3 +90,15 @@ def test_what_is_neither_to_be_taken_nor_held_has_no_approach():
 def test_a_sample_says_how_many_steps_were_executed_before_it():
     samples = policy_samples(make_episodes([3, 5]), chunk_length=4)
     assert samples[keys.NUM_STEPS].tolist() == [[0], [1], [2], [0], [1], [2], [3], [4]]
+
+
+def test_images_may_be_added_later():
+    episodes = make_episodes([3, 5])
+    without = policy_samples(episodes, chunk_length=4, images=False)
+    assert without["episode"].tolist() == [0] * 3 + [1] * 5
+    assert not {keys.IMAGE, keys.INSTRUCTION} & set(without.keys(True))
+    rows = torch.tensor([6, 0, 2])
+    later, whole = with_images(episodes, without[rows]), policy_samples(episodes, chunk_length=4)[rows]
+    assert set(later.keys(True, True)) == set(whole.keys(True, True))
+    assert torch.equal(later[keys.WRIST_IMAGE], whole[keys.WRIST_IMAGE])
+    assert instructions_of(later) == instructions_of(whole)

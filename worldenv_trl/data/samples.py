@@ -20,12 +20,12 @@ from worldenv_trl.keys import (
 )
 from worldenv_trl.row_texts import row_texts
 
-__all__ = ["policy_samples"]
+__all__ = ["executed_steps", "gripper_changes", "policy_samples", "samples_at", "with_images"]
 
 _STEP = 0.05  # of an action, so that a step in which the hand does not move over the table counts as one
 
 
-def policy_samples(episodes: Episodes, chunk_length: int = CHUNK_LENGTH) -> TensorDict:
+def policy_samples(episodes: Episodes, chunk_length: int = CHUNK_LENGTH, *, images: bool = True) -> TensorDict:
     """One sample for each executed step of ``episodes``.
 
     Returns a TensorDict [N], episode after episode: ``("observation", ...)`` uint8 [N, 3, H, W] of every camera,
@@ -37,24 +37,48 @@ def policy_samples(episodes: Episodes, chunk_length: int = CHUNK_LENGTH) -> Tens
     the table to there, from this step on, that each action goes; 0 where the episode ends without another change,
     unless something is held: then its end is where that is put.
 
+    Without ``images`` neither these nor the instruction are there, but ``episode`` int64 [N], which of the episodes
+    each is of: :func:`with_images` adds them to those of a batch, where all together are too many.
+
     Raises:
         ValueError: for a chunk shorter than one step, or episodes in which nothing was executed.
     """
     if chunk_length < 1:
         raise ValueError(f"chunk_length must be at least 1, got {chunk_length}")
+    episode, step = executed_steps(episodes)
+    if not len(episode):
+        raise ValueError(f"the {len(episodes)} episodes hold no executed step to learn from")
+    samples = samples_at(episodes, episode, step, chunk_length)
+    return with_images(episodes, samples) if images else samples
+
+
+def executed_steps(episodes: Episodes) -> tuple[torch.Tensor, torch.Tensor]:
+    """Episode and step, int64 [N] each, of every executed step, episode after episode."""
     length = episodes["length"]  # [R, 1]
     steps = torch.arange(episodes["actions"].shape[1], device=length.device)
     episode, step = (steps < length).nonzero(as_tuple=True)
-    if not len(episode):
-        raise ValueError(f"the {len(episodes)} episodes hold no executed step to learn from")
+    return episode, step
+
+
+def with_images(episodes: Episodes, samples: TensorDict) -> TensorDict:
+    """A copy of samples [N] without images, of these episodes, with the images of every camera and the instruction
+    instead of ``episode``; see :func:`policy_samples`."""
+    out = samples.copy()
+    episode, step = out.pop("episode"), samples[NUM_STEPS].squeeze(-1)
+    for camera in episodes.cameras:
+        out[image_key(camera)] = episodes.frames(camera, episode, step)
+    return out.set(INSTRUCTION, row_texts([episodes.instructions[row] for row in episode.tolist()]))
+
+
+def samples_at(episodes: Episodes, episode: torch.Tensor, step: torch.Tensor, chunk_length: int) -> TensorDict:
+    """What :func:`policy_samples` tells without images of the executed steps ``step`` of the episodes ``episode``,
+    int64 [N] each."""
+    length = episodes["length"]
     wanted = step.unsqueeze(-1) + torch.arange(chunk_length, device=step.device)  # [N, C]
     end = length[episode]
     chunk = episodes["actions"][episode.unsqueeze(-1), torch.minimum(wanted, end - 1)]
     out = TensorDict({STATE: episodes["states"][episode, step], NUM_STEPS: step[:, None]}, batch_size=[len(episode)])
-    for camera in episodes.cameras:
-        out[image_key(camera)] = episodes.frames(camera, episode, step)
-    out.set(INSTRUCTION, row_texts([episodes.instructions[row] for row in episode.tolist()]))
-    out[CHUNK], out[ACTION_IS_PAD] = chunk, wanted >= end
+    out[CHUNK], out[ACTION_IS_PAD], out["episode"] = chunk, wanted >= end, episode
     change = _next_change(episodes)[episode, step]
     out[WAYPOINT] = episodes["states"][episode, change, :3]
     goes = (change.unsqueeze(-1) < end) | _holding(episodes)[episode, step].unsqueeze(-1)
@@ -78,12 +102,18 @@ def _way(episodes: Episodes) -> torch.Tensor:
     return F.pad(told.cumsum(1), (1, 0))
 
 
-def _next_change(episodes: Episodes) -> torch.Tensor:
-    """int64 [R, T]: the first step behind each at which the gripper's command changes, or the episode's end."""
+def gripper_changes(episodes: Episodes) -> torch.Tensor:
+    """bool [R, T]: the executed steps at which the gripper is told otherwise than at the step before."""
     closing, length = episodes["actions"][..., -1] > 0, episodes["length"]
-    steps = torch.arange(closing.shape[1], device=length.device)
     change = torch.zeros_like(closing)
     change[:, 1:] = closing[:, 1:] != closing[:, :-1]
-    at = torch.where(change & (steps < length), steps, length)
+    return change & (torch.arange(closing.shape[1], device=length.device) < length)
+
+
+def _next_change(episodes: Episodes) -> torch.Tensor:
+    """int64 [R, T]: the first step behind each at which the gripper's command changes, or the episode's end."""
+    length = episodes["length"]
+    steps = torch.arange(episodes["actions"].shape[1], device=length.device)
+    at = torch.where(gripper_changes(episodes), steps, length)
     behind = torch.cat([at[:, 1:], length], 1)  # a change at this very step lies behind the hand
     return behind.flip(1).cummin(1).values.flip(1)

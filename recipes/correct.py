@@ -1,0 +1,107 @@
+"""The policy is taught where its hand has to go, by what exploration found out.
+
+Of two demonstrations a policy learns to aim centimetres beside the thing in one picture of six, and to follow its aim
+half of the way. Noise succeeds there once in a while: then the place is known, of that initial state, and every other
+rollout from there, led to it, is a demonstration (:func:`~worldenv_trl.data.corrected_samples`). LOOP knows of no
+place, but whether a rollout ended well. The demonstrations stay a part of each batch, and so does what greedy rollouts
+that succeed have done, or what is not corrected would be forgotten.
+
+Part of the stage ``adapt``, before the world model's frames are shown.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torch.nn import Parameter
+
+import processes
+from episodes import explored_at, recorded_episodes, round_of
+from holding import solved
+from run import Run
+from sft import cloning, decision_weights, lowest_heights, train
+from worldenv_trl import keys
+from worldenv_trl.data import Episodes, corrected_samples, policy_samples, until_reached, with_images
+from worldenv_trl.policies import Policy
+
+_SHARES = (0.4, 0.4, 0.2)  # of a task: demonstrations, corrected, kept
+
+
+def correct(run: Run, policy: Policy, parameters: list[Parameter], models: str) -> None:
+    """``adapt.correct_steps`` updates of a policy's ``parameters`` by what a round explored; none where every task in
+    which the gripper opens or closes is solved."""
+    settings = run.config.adapt
+    if not settings.correct_steps:
+        return
+    lessons = Corrections(run, round_of(models))
+    unsolved = lessons.tasks - set(solved(run, models)[1])
+    if not unsolved:
+        if processes.is_main():
+            print("adapt: nothing to correct, every task whose successes open or close the gripper is solved")
+        return
+    if processes.is_main():
+        print(f"adapt: corrected from {lessons.told} initial states, {len(lessons)} samples")
+    loss = cloning(policy, run)
+    steps, rate = settings.correct_steps, settings.correct_lr
+    train(policy, loss, lessons, parameters, steps, rate, run, "correct", stage="adapted" + models)
+
+
+class Corrections:
+    """Demonstrations, explored rollouts led to where others took hold, and what greedy ones that succeed have done: two
+    parts, two parts and one of each task, as far as it has them.
+
+    Attributes:
+        tasks: numbers of the tasks in which something is corrected.
+        told: how many initial states a place is known of.
+    """
+
+    def __init__(self, run: Run, number: int) -> None:
+        config, length = run.config, run.config.chunk_length
+        factors = [factor for factor in config.explore.scale_factors if factor <= config.post_train.scale_factor]
+        explored = [until_reached(explored_at(run, number, [factor])) for factor in factors]
+        demonstrated = recorded_episodes(run, number)[0]
+        everything, first = Episodes.cat([demonstrated, *explored]), len(demonstrated)
+        self._episodes = everything.through(config.sft.cameras or config.cameras)
+        noise = torch.cat([torch.full((len(part),), factor) for factor, part in zip(factors, explored, strict=True)])
+        corrected = corrected_samples(self._episodes[torch.arange(first, len(self._episodes))], noise, length)
+        corrected["episode"] += first
+        greedy = torch.cat([torch.zeros(first, dtype=torch.bool), noise == 0])
+        kept = greedy & self._episodes["success"].any(1)
+        parts = [self._all(torch.arange(len(kept)) < first, length), corrected]
+        parts += [self._all(kept, length)] if kept.any() else []
+        tasks = [self._episodes[keys.TASK_ID][part["episode"], 0] for part in parts]
+        self.tasks = set(tasks[1].tolist())
+        self.told = len(self._episodes[keys.CONTEXT_ID][corrected["episode"], 0].unique())
+        weights = []
+        for part, task, share in zip(parts, tasks, _SHARES, strict=False):
+            weight = torch.zeros(len(part), dtype=torch.double)
+            for each in task.unique():
+                rows = (task == each).nonzero().squeeze(-1)
+                weight[rows] = share * decision_weights(part[rows], length, config.sft.decision_share).double()
+            weights.append(weight)
+        self._samples, self._weights = torch.cat(parts), torch.cat(weights)
+        texts = [self._episodes.instructions[row] for row in parts[0]["episode"].tolist()]
+        self._lowest = lowest_heights(texts, parts[0][keys.STATE])
+
+    def _all(self, of: Tensor, chunk_length: int) -> TensorDict:
+        """Samples of every executed step of the episodes ``of``, bool [R], at least one of them."""
+        rows = of.nonzero().squeeze(-1)
+        out = policy_samples(self._episodes[rows], chunk_length, images=False)
+        return out.set("episode", rows[out["episode"]])
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    @property
+    def lowest(self) -> dict[str, float]:
+        return self._lowest
+
+    def draw(self, count: int) -> Tensor:
+        return torch.multinomial(self._weights, count, replacement=True)
+
+    def __getitem__(self, rows: Tensor) -> TensorDictBase:
+        samples: Any = self._samples[rows]
+        return with_images(self._episodes, samples)
