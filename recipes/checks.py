@@ -124,8 +124,8 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     if config.adapt.correct_steps:
         if not config.adapt.steps:
             raise ValueError(
-                f"adapt.correct_steps is a part of adapting: adapt.steps must be at least 1 with it, or it 0, got "
-                f"{config.adapt.correct_steps} with adapt.steps 0"
+                "adapt.correct_steps is a part of adapting: it must be 0 where adapt.steps is 0, got "
+                f"{config.adapt.correct_steps}"
             )
         if 0.0 not in config.explore.scale_factors:
             raise ValueError(

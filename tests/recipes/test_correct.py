@@ -139,7 +139,7 @@ def test_only_scales_that_loop_does_not_exceed_are_asked(run, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"adapt": config.Adapt(steps=0, correct_steps=5)}, "adapt.steps must be at least 1 with it, or it 0, got 5"),
+        ({"adapt": config.Adapt(steps=0, correct_steps=5)}, "it must be 0 where adapt.steps is 0, got 5"),
         (
             {"adapt": config.Adapt(steps=1, correct_steps=5)},
             "adapt.correct_steps keeps what greedy rollouts do: explore.scale_factors must hold 0, got 1",
