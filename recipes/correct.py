@@ -1,10 +1,10 @@
 """The policy is taught where its hand has to go, by what exploration found out.
 
-Of two demonstrations a policy learns to aim centimetres beside the thing in one picture of six, and to follow its aim
-half of the way. Noise succeeds there once in a while: then the place is known, of that initial state, and every other
-rollout from there, led to it, is a demonstration (:func:`~worldenv_trl.data.corrected_samples`). LOOP knows of no
-place, but whether a rollout ended well. The demonstrations stay a part of each batch, and so does what greedy rollouts
-that succeed have done, or what is not corrected would be forgotten.
+Of two demonstrations a policy learns to aim centimetres beside the thing in one picture of twelve, and to follow its
+aim four fifths of the way. Noise succeeds there once in a while: then the place is known, of that initial state, and
+every other rollout from there, led to it, is a demonstration (:func:`~worldenv_trl.data.corrected_samples`). LOOP knows
+of no place, but whether a rollout ended well. The demonstrations stay a part of each batch, and so does what greedy
+rollouts that succeed have done, or what is not corrected would be forgotten.
 
 Part of the stage ``adapt``, before the world model's frames are shown.
 """
