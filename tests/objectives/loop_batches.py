@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torch.testing import assert_close
 from torchrl.modules import ProbabilisticActor
 
 from worldenv_trl import keys
@@ -62,3 +63,22 @@ def make_batch(event_dims: int = 1, spread: float = 0.15, seed: int = 8, noise: 
     batch["returns"] = returns[..., None].expand(G, N, T).clone()
     batch[keys.ADVANTAGE] = rloo_advantage(returns)[..., None, None].expand(G, N, T, 1).clone()
     return batch
+
+
+def value_and_gradient(actor, loss, *batches):
+    actor.zero_grad()
+    value = 0.0
+    for batch in batches:
+        part = loss(batch)["loss_objective"]
+        part.backward()
+        value += part.item()
+    gradients = [parameter.grad for parameter in actor.parameters()]
+    return value, [
+        0.0 * each if grad is None else grad.clone() for grad, each in zip(gradients, actor.parameters(), strict=True)
+    ]
+
+
+def assert_same(left, right):
+    assert_close(left[0], right[0], rtol=0, atol=1e-12)
+    for one, other in zip(left[1], right[1], strict=True):
+        assert_close(one, other, rtol=0, atol=1e-12)
