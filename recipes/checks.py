@@ -116,20 +116,18 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             raise ValueError(f"{name} must be at least {len(config.tasks)}, one for each task, got {rows}")
     if not config.explore.scale_factors:
         raise ValueError("explore.scale_factors is empty: name at least one, for instance 1")
-    if config.post_train.hold and 0.0 not in config.explore.scale_factors:
+    if config.adapt.correct_steps and not config.adapt.steps:
         raise ValueError(
-            "post_train.hold asks what greedy rollouts solved: explore.scale_factors must hold 0, got "
-            f"{', '.join(f'{factor:g}' for factor in config.explore.scale_factors)}"
+            "adapt.correct_steps is a part of adapting: it must be 0 where adapt.steps is 0, got "
+            f"{config.adapt.correct_steps}"
         )
-    if config.adapt.correct_steps:
-        if not config.adapt.steps:
+    for setting, asked, why in (
+        ("post_train.hold", bool(config.post_train.hold), "asks what greedy rollouts solved"),
+        ("adapt.correct_steps", bool(config.adapt.correct_steps), "keeps what greedy rollouts do"),
+    ):
+        if asked and 0.0 not in config.explore.scale_factors:
             raise ValueError(
-                "adapt.correct_steps is a part of adapting: it must be 0 where adapt.steps is 0, got "
-                f"{config.adapt.correct_steps}"
-            )
-        if 0.0 not in config.explore.scale_factors:
-            raise ValueError(
-                "adapt.correct_steps keeps what greedy rollouts do: explore.scale_factors must hold 0, got "
+                f"{setting} {why}: explore.scale_factors must hold 0, got "
                 f"{', '.join(f'{factor:g}' for factor in config.explore.scale_factors)}"
             )
     if config.post_train.env == "tabletop":

@@ -56,16 +56,17 @@ class Corrections:
     Attributes:
         tasks: numbers of the tasks in which something is corrected.
         told: how many initial states a place is known of.
+        lowest: see :class:`~sft.Lessons`.
     """
 
     def __init__(self, run: Run, number: int) -> None:
         config, length = run.config, run.config.chunk_length
         factors = [factor for factor in config.explore.scale_factors if factor <= config.post_train.scale_factor]
-        explored = [until_reached(explored_at(run, number, [factor])) for factor in factors]
+        explored = until_reached(explored_at(run, number, factors))
         demonstrated = recorded_episodes(run, number)[0]
-        everything, first = Episodes.cat([demonstrated, *explored]), len(demonstrated)
+        everything, first = Episodes.cat([demonstrated, explored]), len(demonstrated)
         self._episodes = everything.through(config.sft.cameras or config.cameras)
-        noise = torch.cat([torch.full((len(part),), factor) for factor, part in zip(factors, explored, strict=True)])
+        noise = torch.tensor(factors).repeat_interleave(len(explored) // len(factors))  # as many of each
         corrected = corrected_samples(self._episodes[torch.arange(first, len(self._episodes))], noise, length)
         corrected["episode"] += first
         greedy = torch.cat([torch.zeros(first, dtype=torch.bool), noise == 0])
@@ -84,7 +85,7 @@ class Corrections:
             weights.append(weight)
         self._samples, self._weights = torch.cat(parts), torch.cat(weights)
         texts = [self._episodes.instructions[row] for row in parts[0]["episode"].tolist()]
-        self._lowest = lowest_heights(texts, parts[0][keys.STATE])
+        self.lowest = lowest_heights(texts, parts[0][keys.STATE])
 
     def _all(self, of: Tensor, chunk_length: int) -> TensorDict:
         """Samples of every executed step of the episodes ``of``, bool [R], at least one of them."""
@@ -94,10 +95,6 @@ class Corrections:
 
     def __len__(self) -> int:
         return len(self._samples)
-
-    @property
-    def lowest(self) -> dict[str, float]:
-        return self._lowest
 
     def draw(self, count: int) -> Tensor:
         return torch.multinomial(self._weights, count, replacement=True)

@@ -74,7 +74,11 @@ def corrected_samples(
 
 
 def until_reached(episodes: Episodes) -> Episodes:
-    """The same, each no longer than three steps after the goal is first reached."""
+    """The same episodes [R], each no longer than three steps after the goal is first reached; numbers are a copy.
+
+    Raises:
+        KeyError: for episodes without ``success``.
+    """
     out, reached = episodes[torch.arange(len(episodes))], episodes["success"]
     length = out["length"]
     end = torch.where(reached.any(1), reached.int().argmax(1) + 3, length.squeeze(-1))

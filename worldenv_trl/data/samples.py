@@ -61,8 +61,12 @@ def executed_steps(episodes: Episodes) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def with_images(episodes: Episodes, samples: TensorDict) -> TensorDict:
-    """A copy of samples [N] without images, of these episodes, with the images of every camera and the instruction
-    instead of ``episode``; see :func:`policy_samples`."""
+    """A shallow copy of samples [N] without images, of these episodes, with the images uint8 [N, 3, H, W] of every
+    camera and the instruction instead of ``episode``; see :func:`policy_samples`.
+
+    Raises:
+        KeyError: for samples that do not say which episode they are of.
+    """
     out = samples.copy()
     episode, step = out.pop("episode"), samples[NUM_STEPS].squeeze(-1)
     for camera in episodes.cameras:
