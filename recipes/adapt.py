@@ -48,6 +48,7 @@ def adapt(run: Run, source: str = "sft", target: str = "adapted", models: str = 
     policy = run.policy(source).eval()
     if all_held(run, models):  # LOOP is left out
         if processes.is_main():
+            print("adapt: left out, all tasks are held")
             policy.save_pretrained(run.folder.checkpoint(target))
         return
     moved = [each for group in policy.post_training_parameters(config.post_train.lora_rank).values() for each in group]

@@ -41,6 +41,7 @@ DEPENDS_ON: dict[str, tuple[str, ...]] = {
 whole run: its tasks, seed, cameras and so on."""
 _SWITCHES = {
     "adapt": "adapt.steps",
+    "adapt.correct_lr": "adapt.correct_steps",
     "post_train.hold_from": "post_train.hold",
     "post_train.probe_contexts": "post_train.probe_every",
 }

@@ -116,10 +116,16 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             raise ValueError(f"{name} must be at least {len(config.tasks)}, one for each task, got {rows}")
     if not config.explore.scale_factors:
         raise ValueError("explore.scale_factors is empty: name at least one, for instance 1")
+    for factor in config.explore.scale_factors:
+        if config.explore.scale_factors.count(factor) > 1:
+            raise ValueError(
+                f"explore.scale_factors names {factor:g} twice: each factor has as many rollouts; for more of them "
+                "raise explore.episodes_per_task"
+            )
     if config.adapt.correct_steps and not config.adapt.steps:
         raise ValueError(
-            "adapt.correct_steps is a part of adapting: it must be 0 where adapt.steps is 0, got "
-            f"{config.adapt.correct_steps}"
+            "adapt.correct_steps is a part of adapting: set adapt.steps, too, for instance 500, or leave it 0, got "
+            f"{config.adapt.correct_steps} and adapt.steps=0"
         )
     for setting, asked, why in (
         ("post_train.hold", bool(config.post_train.hold), "asks what greedy rollouts solved"),

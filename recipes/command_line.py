@@ -112,14 +112,15 @@ def at_least(low: int, **settings: int | tuple[int, ...]) -> None:
             raise ValueError(f"{option} must be at least {low}, got {min(values)}")
 
 
-def writable(out: Path, *, plot: bool = False) -> Path:
+def writable(out: Path, *, plot: bool = False, option: str = "--out") -> Path:
     """``out``, for which a folder is there now: asked before the work whose figures would be lost.
 
     Args:
-        out: what ``--out`` names, or its default.
+        out: what the option names, or its default.
 
     Keyword Args:
         plot: it must end like a format of matplotlib's.
+        option: that names it.
 
     Raises:
         OSError: if no file can be written there.
@@ -129,9 +130,11 @@ def writable(out: Path, *, plot: bool = False) -> Path:
         from matplotlib.backend_bases import FigureCanvasBase  # not for the commands that draw nothing
 
         if out.suffix.lower().removeprefix(".") not in FigureCanvasBase.get_supported_filetypes():
-            raise ValueError(f"--out must end like a picture, for instance {out.with_suffix('.png').name}, got {out}")
+            raise ValueError(
+                f"{option} must end like a picture, for instance {out.with_suffix('.png').name}, got {out}"
+            )
     if out.is_dir():
-        raise IsADirectoryError(f"--out must be a file, {out} is a folder")
+        raise IsADirectoryError(f"{option} must be a file, {out} is a folder")
     out.parent.mkdir(parents=True, exist_ok=True)
     with open(out, "a") if out.exists() else tempfile.TemporaryFile(dir=out.parent):
         return out

@@ -11,6 +11,7 @@ Part of the stage ``adapt``, before the world model's frames are shown.
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import torch
@@ -37,8 +38,14 @@ def correct(run: Run, policy: Policy, parameters: list[Parameter], models: str) 
     if not settings.correct_steps:
         return
     lessons = Corrections(run, round_of(models))
-    unsolved = lessons.tasks - set(solved(run, models)[1])
-    if not unsolved:
+    if not lessons.tasks:
+        warnings.warn(
+            "nothing is corrected: no explored rollout that reaches its goal tells where a thing is taken hold of; "
+            "more of them may (--explore.episodes-per-task), or those of a policy of more demonstrations",
+            stacklevel=2,
+        )
+        return
+    if lessons.tasks <= set(solved(run, models)[1]):
         if processes.is_main():
             print("adapt: nothing to correct, every task whose successes open or close the gripper is solved")
         return

@@ -160,7 +160,7 @@ def _show_parts(found: Rehearsal) -> None:
 
 
 def _show_stages(plans: Sequence[StagePlan], machine: Machine) -> None:
-    each = f"{machine.flops / 1e12:.1f} TFLOP/s and {_bytes(machine.memory)} each"
+    each = f"{_flops(machine.flops)}/s and {_bytes(machine.memory)} each"
     print(f"\nat most, on {machine.gpus} x {machine.name} ({each}) at {machine.share:.0%} of the matmul bound;")
     print("memory of one, with parts whole or sharded (FSDP):")
     print(f"{'stage':<16}{'operations':>16}{'time':>12}{'activations':>13}{'whole':>11}{'sharded':>11}")

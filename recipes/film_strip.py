@@ -49,16 +49,13 @@ def main(settings: Settings) -> None:
     with refusals():
         at_least(2, columns=settings.columns)
         at_least(0, state=settings.state)
+        config = read_config(RunRecord.read(settings.run), settings.num_threads, settings.device)
         out = writable(settings.out or settings.run / "film_strip.png", plot=True)
         use_threads(settings.num_threads)
-        config = read_config(RunRecord.read(settings.run), settings.num_threads, settings.device)
         run = Run(config, RunFolder(settings.run))
         models = run.world_model(), run.reflector(), run.rules()
         actor = policy_actor(run.policy(settings.policy).eval())
-        count = settings.state + 1
-        episodes = live(run, actor, count)
-    rows = torch.arange(len(config.tasks)) * count + settings.state
-    worlds = imagine(run, *models, episodes[rows])
+        worlds = imagine(run, *models, live(run, actor, range(settings.state, settings.state + 1)))
     draw(worlds, config.tasks, settings.columns, out)
     print(f"{out}: {out.stat().st_size / 1e3:,.0f} kB")
 

@@ -61,9 +61,9 @@ def gather(
     missing = [] if len(policies) == 2 else ["the stage post_train has not finished: the policy before it is shown"]
     worlds: dict[str, TwoWorlds] = {}
     for name in policies:
-        print(f"{name}: {episodes_per_task} held-out episodes a task, in the physics and in imagination")
         actor = policy_actor(run.policy(name).eval())
-        worlds[name] = imagine(run, world_model, reflector, rules, live(run, actor, episodes_per_task))
+        print(f"{name}: {episodes_per_task} held-out episodes a task, in the physics and in imagination")
+        worlds[name] = imagine(run, world_model, reflector, rules, live(run, actor, range(episodes_per_task)))
     waves = []
     for path in _waves(record, suffix):
         try:

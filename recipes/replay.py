@@ -20,7 +20,7 @@ from typing import Any
 
 import tyro
 
-from command_line import one_line_errors
+from command_line import one_line_errors, writable
 from parts import COMPACT, Kind, Part, Parts
 from worldenv_trl.devices import choose_device
 from worldenv_trl.policies import AutoregressiveActor, LaplaceActor, Policy, policy_actor, scale_bounds
@@ -65,8 +65,9 @@ class Options:
 
 @one_line_errors
 def main(options: Options, parts: Parts = COMPACT) -> int:
-    if options.json is not None and str(options.json) != "-" and options.json.exists() and not options.overwrite:
-        raise FileExistsError(f"{options.json} exists: pass --overwrite or another name")
+    report_file = None if str(options.json) == "-" else options.json
+    if report_file is not None and report_file.exists() and not options.overwrite:
+        raise FileExistsError(f"{report_file} exists: pass --overwrite or another name")
     if options.threshold is not None and not 0 < options.threshold < 1:
         raise ValueError(f"--threshold must be in (0, 1), got {options.threshold}")
     metadata = read_metadata(options.file)
@@ -87,6 +88,8 @@ def main(options: Options, parts: Parts = COMPACT) -> int:
     if imagined:
         found = _checkpoint(parts.world_model, options.world_model, options.file, metadata, "world_model")
         world_model = found.to(device)
+    if report_file is not None:
+        writable(report_file, option="--json")
     report = replay(
         options.file,
         options.rollout,
@@ -105,8 +108,8 @@ def main(options: Options, parts: Parts = COMPACT) -> int:
     )
     words = json.dumps(report.to_json(), indent=2)
     print(words if str(options.json) == "-" else report)
-    if options.json is not None and str(options.json) != "-":
-        options.json.write_text(words + "\n")
+    if report_file is not None:
+        report_file.write_text(words + "\n")
     return 0
 
 

@@ -55,7 +55,7 @@ def write(settings: Report, parts: Parts | None = None) -> Path:
 
     Raises:
         OSError: if there is no run folder, or the report cannot be written.
-        ValueError: for settings out of range, or a run whose settings cannot be read.
+        ValueError: for settings out of range, a run whose settings cannot be read, or models of other parts.
     """
     record = RunRecord.read(settings.run)
     out = settings.run / "report.html" if settings.out is None else settings.out
@@ -75,9 +75,9 @@ def write(settings: Report, parts: Parts | None = None) -> Path:
         try:
             counts = settings.episodes_per_task, settings.clips_per_kind
             evidence = gather(record, *counts, settings.num_threads, parts, settings.device)
-        except OtherClassError as error:
+        except OtherClassError as error:  # a report of these models may be there already
             own = "parts of your own are passed as recipes/README.md says: report.write(report.Report(folder), parts)"
-            evidence = Evidence(missing=[f"{short(error)}; {own}"])
+            raise ValueError(f"{short(error)}; {own}; --no-models shows the logged figures alone") from error
         except (OSError, ValueError, RuntimeError) as error:  # the logged figures are shown all the same
             evidence = Evidence(missing=[short(error)])
         for what in evidence.missing:

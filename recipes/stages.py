@@ -18,7 +18,7 @@ from tqdm import tqdm
 import processes
 from beginning import beginning
 from checks import check_config, check_shares
-from command_line import expected, in_options, refusals
+from command_line import INTERRUPTED, expected, in_options, refusals
 from config import PRESETS, WorldEnvConfig
 from libero_files import from_libero, with_files
 from parts import Parts
@@ -224,8 +224,9 @@ def _run(stage: Stage, work: Work, run: Run) -> None:
         # Libraries may have turned the KeyboardInterrupt into an error of their own.
         if not processes.is_main():
             raise SystemExit(1) from error
-        message = f"interrupted in stage {stage.name}: the same command continues"
-        raise SystemExit(f"\n{message}, finished stages are kept") from error
+        message = f"interrupted in stage {stage.name}: the same command continues, finished stages are kept"
+        print(f"\n{message}", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from error
     finally:
         if here:
             signal.signal(signal.SIGINT, before)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -46,21 +47,21 @@ class TwoWorlds:
         return judged(self.imagined_stop, self.reached, late)
 
 
-def live(run: Run, actor: TensorDictModuleBase, per_task: int, split: str = "test") -> Episodes:
+def live(run: Run, actor: TensorDictModuleBase, states: Sequence[int], split: str = "test") -> Episodes:
     """Greedy episodes of every task in the physics, each to the step limit whether the goal is reached or not.
 
     Returns:
-        Episodes ``[R]`` (:func:`~worldenv_trl.data.episodes_from_rollouts`) from the first ``per_task`` initial states
-        of the split.
+        Episodes ``[R]`` (:func:`~worldenv_trl.data.episodes_from_rollouts`) from the initial states of the split with
+        these numbers, task after task.
     """
     config, parts = run.config, []
     for task in config.tasks:
-        options = {"init_state_mode": "cycle", "init_state_count": per_task, "terminate_on_success": False}
+        options = starting_at(config, split, task, states)
         collector = GroupCollector(
-            step_env(config, split, per_task, [task], **options),
+            step_env(config, split, len(states), [task], terminate_on_success=False, **options),
             chunk_player(actor, config.chunk_length),
-            groups_per_batch=per_task,
-            total_groups=per_task,
+            groups_per_batch=len(states),
+            total_groups=len(states),
             max_decisions=config.max_steps,
             exploration_type=ExplorationType.DETERMINISTIC,
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from small_rollouts import make_episodes
@@ -109,6 +111,8 @@ def test_episodes_end_three_steps_after_the_goal_is_reached():
     ("noise", "options", "message"),
     [
         (torch.ones(2), {}, r"noise must be \[1\], one number for each episode, got \[2\]"),
+        (torch.full((1,), math.nan), {}, "noise must be numbers, 1 of 1 are NaN"),
+        (torch.ones(1), {"reach": math.nan}, "reach positive, got 8 and nan"),
         (torch.ones(1), {"chunk_length": 0}, "chunk_length must be at least 1"),
         (torch.ones(1), {"reach": 0.0}, "reach positive, got 8 and 0.0"),
     ],

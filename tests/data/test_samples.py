@@ -102,3 +102,5 @@ def test_images_may_be_added_later():
     assert set(later.keys(True, True)) == set(whole.keys(True, True))
     assert torch.equal(later[keys.WRIST_IMAGE], whole[keys.WRIST_IMAGE])
     assert instructions_of(later) == instructions_of(whole)
+    with pytest.raises(ValueError, match="no samples"):
+        with_images(episodes, without[:0])

@@ -245,6 +245,12 @@ def test_an_env_that_does_not_show_what_the_reflector_looks_at_is_refused_at_onc
         TransformedEnv(FilmEnv({"agentview": film([[10] * 8])}), around(reflect))
 
 
+@pytest.mark.parametrize("given", [(FirstPixel(), 0.5), (torch.nn.Identity(), StopRule())])
+def test_what_is_no_reflector_or_no_rule_is_refused_at_once(given):
+    with pytest.raises(TypeError, match=r"must be a (Reflector|StopRule), got (Identity|float)"):
+        Reflect(*given)
+
+
 def test_a_refused_transform_may_be_put_onto_another_env():
     reflect = Reflect(FirstPixel(cameras=("wrist",)))
     with pytest.raises(ValueError, match="'wrist'"):

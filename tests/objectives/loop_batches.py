@@ -54,7 +54,7 @@ def make_batch(event_dims: int = 1, spread: float = 0.15, seed: int = 8, noise: 
         log_probs = density.log_prob(chunk)
     batch[keys.CHUNK] = chunk
     shift = spread * torch.randn(log_probs.shape, generator=generator, dtype=torch.float64)
-    batch[keys.LOG_PROBS] = log_probs + (shift if noise == "step" else shift[..., :1])
+    batch[keys.LOG_PROBS] = log_probs + (shift if noise == "step" else shift[:, :, :, :1])
     steps = torch.arange(T * C).view(T, C) < torch.tensor(LENGTHS)[..., None, None]
     batch["next"] = TensorDict({keys.STEP_MASK: steps}, [G, N, T])
     batch[keys.STEP_MASK] = torch.cat([torch.zeros_like(steps[:, :, :1]), steps[:, :, :-1]], 2)

@@ -91,6 +91,18 @@ def test_a_chunk_that_is_displaced_as_a_whole_has_one_ratio_already():
         loss(make_batch(noise="chunk"))
 
 
+@pytest.mark.parametrize(("sampled", "scored"), [("chunk", "step"), ("step", "chunk")])
+@pytest.mark.parametrize("events", [0, 1])
+def test_a_density_other_than_the_one_that_was_sampled_from_is_refused(sampled, scored, events):
+    batch = make_batch(events, noise=sampled)
+    batch[keys.LOG_PROBS][~batch[keys.MASK]] = math.nan  # nobody's
+    LOOPLoss(make_actor(events, noise=sampled))(batch)
+    with pytest.raises(
+        ValueError, match=r"log_probs'.* are not of the density .*: collect and train with the same noise"
+    ):
+        LOOPLoss(make_actor(events, noise=scored))(batch)
+
+
 def test_per_dimension_log_probs_also_serve_step_ratios():
     actor, batch = make_actor(0), make_batch(0)
     assert_same(value_and_gradient(actor, LOOPLoss(actor), batch), slow(actor, batch))
@@ -347,11 +359,19 @@ def test_entries_that_do_not_fit_are_named(change, message):
 
 
 def test_settings_that_cannot_work_are_named():
-    for kwargs in ({"clip_epsilon": 0.0}, {"clip_epsilon": (1.0, 0.1)}, {"ratio_level": "x"}, {"normalize": "x"}):
+    for kwargs in (
+        {"clip_epsilon": 0.0},
+        {"clip_epsilon": (1.0, 0.1)},
+        {"clip_epsilon": (0.1,) * 3},
+        {"ratio_level": "x"},
+        {"normalize": "x"},
+    ):
         with pytest.raises(ValueError, match=next(iter(kwargs))):
             LOOPLoss(make_actor(), **kwargs)
     with pytest.raises(ValueError, match="event_dims=0"):
         LOOPLoss(make_actor(), ratio_level="dim")(make_batch())
+    with pytest.raises(ValueError, match="actor of tokens"):
+        LOOPLoss(make_actor(), ratio_level="token")(make_batch())
     with pytest.raises(ValueError, match="event_dims=1"):
         rows = make_batch()
         rows[keys.LOG_PROBS] = rows[keys.LOG_PROBS].sum(-1)

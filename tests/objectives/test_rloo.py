@@ -33,3 +33,9 @@ def test_equal_returns_teach_nothing():
 def test_a_group_of_one_is_refused(shape):
     with pytest.raises(ValueError, match="at least 2 rollouts"):
         rloo_advantage(torch.zeros(shape))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_return_that_is_no_number_is_refused(value):
+    with pytest.raises(ValueError, match="1 of 4 are not"):
+        rloo_advantage(torch.tensor([[0.0, 1.0], [value, 1.0]]))

@@ -130,6 +130,7 @@ def test_what_comes_over_ends_where_a_setting_differs(whole, tmp_path, change, l
     ("off", "change"),
     [
         ("adapt.steps", {"adapt__lr": 1e-5, "adapt__batch_size": 3}),
+        ("adapt.correct_steps", {"adapt__correct_lr": 1e-5}),
         ("post_train.hold", {"post_train__hold_from": 0.5}),
         ("post_train.probe_every", {"post_train__probe_contexts": 3}),
     ],

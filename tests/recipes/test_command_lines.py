@@ -107,6 +107,7 @@ REPLAY = [
     (("real.mcap", "--target", "taken.mcap"), "taken.mcap exists: pass --overwrite"),
     (("real.mcap", "--target", "new.bag"), "must end in .mcap"),
     (("real.mcap", "--json", "taken.mcap"), "taken.mcap exists: pass --overwrite"),
+    (("real.mcap", "--json", "empty", "--overwrite"), "--json must be a file, empty is a folder"),
 ]
 VIEW = [
     *READERS,

@@ -50,6 +50,11 @@ def told(run, number, factors):
     return episodes
 
 
+def failing(episodes):
+    episodes["success"] &= False
+    return until_reached(episodes)
+
+
 @pytest.fixture
 def run(explored_run, monkeypatch):
     monkeypatch.setattr(correcting, "explored_at", told)
@@ -122,6 +127,15 @@ def test_nothing_is_learned_where_all_that_could_be_corrected_is_solved(run, mon
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
 
 
+def test_where_no_success_tells_of_a_place_it_is_said_that_nothing_is_corrected(run, monkeypatch):
+    policy = run.policy("sft").eval()
+    before = {name: value.clone() for name, value in policy.state_dict().items()}
+    monkeypatch.setattr(correcting, "until_reached", failing)
+    with pytest.warns(UserWarning, match="nothing is corrected: no explored rollout that reaches its goal tells"):
+        correct(run, policy, parameters_of(policy), "")
+    assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
+
+
 def test_only_scales_that_loop_does_not_exceed_are_asked(run, monkeypatch):
     asked = []
 
@@ -139,7 +153,7 @@ def test_only_scales_that_loop_does_not_exceed_are_asked(run, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"adapt": config.Adapt(steps=0, correct_steps=5)}, "it must be 0 where adapt.steps is 0, got 5"),
+        ({"adapt": config.Adapt(steps=0, correct_steps=5)}, "set adapt.steps, too, .* got 5 and adapt.steps=0"),
         (
             {"adapt": config.Adapt(steps=1, correct_steps=5)},
             "adapt.correct_steps keeps what greedy rollouts do: explore.scale_factors must hold 0, got 1",

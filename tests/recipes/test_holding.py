@@ -62,10 +62,11 @@ def learned(run, monkeypatch, weight, solved):
     return run.policy(name).state_dict(), run.folder.read_metrics(name)
 
 
-def test_where_all_tasks_are_held_nothing_is_adapted(physics, monkeypatch):
+def test_where_all_tasks_are_held_nothing_is_adapted_and_that_is_said(physics, monkeypatch, capsys):
     monkeypatch.setattr(holding, "explored_at", lambda *_: episodes([0, 0], [1, 1]))
     settings = dataclasses.replace(physics.config.post_train, hold=1.0)
     adapt(dataclasses.replace(physics, config=dataclasses.replace(physics.config, post_train=settings)))
+    assert "adapt: left out, all tasks are held" in capsys.readouterr().out
     source, kept = physics.policy("sft").state_dict(), physics.policy("adapted").state_dict()
     assert all(torch.equal(value, source[name]) for name, value in kept.items())
 

@@ -61,9 +61,10 @@ def call(recipe, *arguments) -> int:
 
 
 def test_a_replay_is_printed_in_words_and_kept_as_json(run, tmp_path, capsys):
-    assert call(replay_recipe, run / "rollouts" / "real.mcap", "--rollout", 1, "--json", tmp_path / "r.json") == 0
+    kept = tmp_path / "new" / "r.json"
+    assert call(replay_recipe, run / "rollouts" / "real.mcap", "--rollout", 1, "--json", kept) == 0
     assert "bit-exact: sim_state" in capsys.readouterr().out
-    assert json.loads((tmp_path / "r.json").read_text())["exact"] is True
+    assert json.loads(kept.read_text())["exact"] is True
     assert (run / "rollouts" / "real_rollout1_replay.mcap").exists()
     assert call(replay_recipe, run / "rollouts" / "real.mcap", "--rollout", 1) == 1
     assert "exists: pass --overwrite" in capsys.readouterr().err

@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 
+import film_strip
 from config import GOAL_TASKS, PRESETS, SFT
 from parts import make_policy, make_reflector, make_world_model
 from report import Report, main
@@ -143,14 +144,17 @@ def test_a_task_file_that_is_not_found_from_here_is_named_with_the_folder_to_cal
     assert "<video" in report_of(run, clips_per_kind=1)
 
 
-def test_parts_of_the_users_own_are_said_to_be_passed(finished, tmp_path, capsys):
+def test_parts_of_the_users_own_are_said_to_be_passed_and_their_report_stays(finished, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     path = run / "checkpoints" / "world_model" / "config.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"class": "MyWorldModel"}))
-    assert "<video" not in report_of(run)
-    assert "holds MyWorldModel, not VideoWorldModel" in (said := capsys.readouterr().out)
-    assert "report.write(report.Report(folder), parts)" in said
+    (run / "report.html").write_text("of before")
+    own = r"holds MyWorldModel, not VideoWorldModel.* report.write\(report.Report\(folder\), parts\); --no-models"
+    with pytest.raises(SystemExit, match=own):
+        main(Report(run))
+    assert (run / "report.html").read_text() == "of before"
+    assert "<video" not in report_of(run, models=False)
 
 
 def test_the_versions_of_the_run_are_shown_beside_those_of_the_report(finished, tmp_path):
@@ -172,3 +176,11 @@ def test_it_says_whose_stages_a_run_began_with(finished, tmp_path):
     assert "Taken over" not in report_of(run, models=False)
     (run / "begun.json").write_text(json.dumps({"run": "/of/<others>", "stages": ["demonstrate", "sft"]}))
     assert "Taken over from /of/&lt;others&gt;: demonstrate, sft." in report_of(run, models=False)
+
+
+def test_a_film_strip_is_drawn_of_a_run_and_leaves_nothing_where_there_is_none(finished, tmp_path):
+    film_strip.main(film_strip.Settings(finished, out=tmp_path / "new" / "strip.png", state=1, columns=2))
+    assert (tmp_path / "new" / "strip.png").stat().st_size > 1000
+    with pytest.raises(SystemExit, match="nosuch does not exist"):
+        film_strip.main(film_strip.Settings(tmp_path / "nosuch"))
+    assert not (tmp_path / "nosuch").exists()

@@ -56,6 +56,13 @@ def test_an_episode_is_played_as_long_as_it_lasts(run, expert_episodes):
 
 
 def test_the_policy_lives_through_the_first_held_out_states(run):
-    episodes = live(run, laplace_actor(make_policy(run.config)), per_task=2)
+    episodes = live(run, laplace_actor(make_policy(run.config)), range(2))
     assert len(episodes) == 4 and episodes.image_size == 64 and (episodes["length"] == 32).all()
     assert episodes[keys.CONTEXT_ID].flatten().tolist() == [context_id(t, "test", k) for t in (0, 1) for k in (0, 1)]
+    second = live(run, laplace_actor(make_policy(run.config)), [1])
+    assert second[keys.CONTEXT_ID].flatten().tolist() == [context_id(t, "test", 1) for t in (0, 1)]
+    frames = [
+        each.frames("agentview", torch.arange(2), torch.zeros(2, dtype=torch.long))
+        for each in (second, episodes[torch.tensor([1, 3])])
+    ]
+    assert torch.equal(*frames)

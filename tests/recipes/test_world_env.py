@@ -59,6 +59,7 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"demonstrate": Demonstrate(51, states="spread")}, "demonstrate.episodes_per_task must be at most 50, train_"),
         ({"demonstrate": Demonstrate(episodes_per_task=0)}, "demonstrate.episodes_per_task must be at least 1"),
         ({"explore": Explore(scale_factors=())}, "explore.scale_factors"),
+        ({"explore": Explore(scale_factors=(0.0, 1.0, 0.0))}, "explore.scale_factors names 0 twice"),
         (
             {"post_train": PostTrain(env="tabletop"), "adapt": Adapt(steps=10)},
             "adapt.steps is of imagination: it must be 0 where post_train.env is tabletop, got 10",
@@ -160,7 +161,7 @@ def test_the_whole_loop_runs_writes_its_files_and_continues_where_it_stopped(tin
     torch.set_num_threads(threads)
 
 
-def test_an_interrupt_ends_with_one_line_even_if_a_library_turns_it_into_an_error(tiny, monkeypatch):
+def test_an_interrupt_ends_with_one_line_even_if_a_library_turns_it_into_an_error(tiny, monkeypatch, capsys):
     def struck(*_):
         try:
             signal.raise_signal(signal.SIGINT)
@@ -169,8 +170,10 @@ def test_an_interrupt_ends_with_one_line_even_if_a_library_turns_it_into_an_erro
 
     before = signal.getsignal(signal.SIGINT)
     monkeypatch.setitem(world_env.WORKS, "demonstrate", struck)
-    with pytest.raises(SystemExit, match="interrupted in stage demonstrate: the same command continues"):
+    with pytest.raises(SystemExit) as ended:
         run_all(tiny)
+    assert ended.value.code == 130
+    assert "interrupted in stage demonstrate: the same command continues" in capsys.readouterr().err
     assert not RunFolder(tiny.run_dir).done("demonstrate")
     assert signal.getsignal(signal.SIGINT) is before
 

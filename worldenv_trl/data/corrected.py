@@ -50,12 +50,16 @@ def corrected_samples(
         gripper's change on. N is 0 where no success tells of a place.
 
     Raises:
-        ValueError: for a noise of another length, a chunk shorter than one step or a reach that is not positive.
+        ValueError: for a noise of another length or with NaN, a chunk shorter than one step or a reach that is not
+            positive.
         KeyError: for episodes without success.
     """
     if noise.shape != (len(episodes),):
         raise ValueError(f"noise must be [{len(episodes)}], one number for each episode, got {list(noise.shape)}")
-    if chunk_length < 1 or reach <= 0:
+    if noise.isnan().any():
+        raise ValueError(f"noise must be numbers, {int(noise.isnan().sum())} of {len(noise)} are NaN")
+    noise = noise.to(torch.get_default_dtype())
+    if chunk_length < 1 or not reach > 0:
         raise ValueError(f"chunk_length must be at least 1 and reach positive, got {chunk_length} and {reach}")
     episodes = until_reached(episodes)
     rows = torch.arange(len(episodes))

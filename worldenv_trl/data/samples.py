@@ -66,9 +66,12 @@ def with_images(episodes: Episodes, samples: TensorDict) -> TensorDict:
 
     Raises:
         KeyError: for samples that do not say which episode they are of.
+        ValueError: for no samples.
     """
     out = samples.copy()
     episode, step = out.pop("episode"), samples[NUM_STEPS].squeeze(-1)
+    if not len(episode):
+        raise ValueError("there are no samples, so no images of them")
     for camera in episodes.cameras:
         out[image_key(camera)] = episodes.frames(camera, episode, step)
     return out.set(INSTRUCTION, row_texts([episodes.instructions[row] for row in episode.tolist()]))

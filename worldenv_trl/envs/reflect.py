@@ -52,6 +52,7 @@ class Reflect(Transform):
         stops: False while scores are written and nothing is ended by them; frames in a row are then not counted.
 
     Raises:
+        TypeError: for what is no reflector, or no rule.
         ValueError: when it is put onto an env that does not show what the reflector looks at, or onto imagination that
             the reflector leaves to another one (``for_world``); when a reflector's state or scores are not of the
             videos that it was given.
@@ -69,6 +70,9 @@ class Reflect(Transform):
     """
 
     def __init__(self, reflector: Reflector, rule: StopRule = StopRule()) -> None:  # noqa: B008 - frozen
+        for name, given, wanted in (("reflector", reflector, Reflector), ("rule", rule, StopRule)):
+            if not isinstance(given, wanted):
+                raise TypeError(f"{name} must be a {wanted.__name__}, got {type(given).__name__}")
         path = [KINEMATIC_STATE] if reflector.reads_path else []
         super().__init__(in_keys=[*(image_key(camera) for camera in reflector.cameras), *path, INSTRUCTION])
         self.out_keys = [SUCCESS_PROB]

@@ -168,6 +168,8 @@ class LOOPLoss(LossModule):
 
     @clip_epsilon.setter
     def clip_epsilon(self, value: float | tuple[float, float]) -> None:
+        if isinstance(value, tuple | list) and len(value) != 2:
+            raise ValueError(f"clip_epsilon must be a number or (low, high), got {value}")
         low, high = value if isinstance(value, tuple | list) else (value, value)
         if not (0 < low < 1 and 0 < high < math.inf):
             raise ValueError(f"clip_epsilon must be positive (and below 1 downwards), got {value}")
@@ -286,6 +288,11 @@ class LOOPLoss(LossModule):
                 f"{names.sample_log_prob} is {list(before.shape)}, the actor scores {list(now.shape)}: "
                 "collect and train with the same event_dims"
             )
+        if not whole and _of_other_noise(before, now, steps, getattr(distribution, "whole_chunks", False)):
+            raise ValueError(
+                f"{names.sample_log_prob} are not of the density that {type(distribution).__name__} is: collect and "
+                "train with the same noise (policies.laplace_actor)"
+            )
         if whole:
             return distribution, *self._whole_log_ratio(now - before, executed & ~padding, steps, advantage)
         return distribution, *self._log_ratio(now - before, steps, advantage)
@@ -324,9 +331,10 @@ class LOOPLoss(LossModule):
         each = difference.ndim == steps.ndim + 1
         if self.ratio_level in _EACH:
             if not each:
-                raise ValueError(
-                    f"ratio_level={self.ratio_level!r} needs log-probs [*B, C, 7]: build the actor with event_dims=0"
-                )
+                remedy = "build the actor with event_dims=0"
+                if self.ratio_level == "token":
+                    remedy = "that is of an actor of tokens with event_dims=0, set_keys(action=keys.TOKENS)"
+                raise ValueError(f"ratio_level={self.ratio_level!r} needs log-probs [*B, C, 7]: {remedy}")
             mask = steps.unsqueeze(-1).expand_as(difference)
             return torch.where(mask, difference, 0.0), mask, advantage.unsqueeze(-1)
         difference = torch.where(steps, difference.sum(-1) if each else difference, 0.0)
@@ -362,3 +370,13 @@ class LOOPLoss(LossModule):
             "clip_fraction": outside.sum() / count,
             "ESS": ratio.sum().square() / ratio.square().sum().clamp_min(1e-12) / count,
         }
+
+
+def _of_other_noise(before: Tensor, now: Tensor, steps: Tensor, whole_chunks: bool) -> bool:
+    """Whether log-probs [*B, C] or [*B, C, 7] tell that their chunks were sampled otherwise than the actor samples:
+    whole ones have the same number at every step, others do not."""
+    if steps.shape[-1] < 2 or before.ndim < steps.ndim or torch.compiler.is_compiling():
+        return False
+    counted = steps.any(-1)  # others may hold anything
+    alike = [bool((each == each[:, :1]).all()) for each in (before[counted], now.detach()[counted])]
+    return not alike[0] if whole_chunks else alike == [True, False] and bool((before[counted] != 0).any())

@@ -15,7 +15,7 @@ def rloo_advantage(returns: Tensor) -> Tensor:
         ``[..., N]``; sums to zero over each group, and is not divided by a standard deviation.
 
     Raises:
-        ValueError: if a group has fewer than two rollouts.
+        ValueError: if a group has fewer than two rollouts, or a return is not finite.
 
     Examples:
         >>> import torch
@@ -26,5 +26,7 @@ def rloo_advantage(returns: Tensor) -> Tensor:
         raise ValueError(
             f"leave-one-out needs at least 2 rollouts in a group, got returns of shape {list(returns.shape)}"
         )
+    if not returns.isfinite().all():
+        raise ValueError(f"returns must be finite, {int((~returns.isfinite()).sum())} of {returns.numel()} are not")
     n = returns.shape[-1]
     return (returns - returns.mean(-1, keepdim=True)) * (n / (n - 1))
