@@ -122,14 +122,9 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
                 f"explore.scale_factors names {factor:g} twice: each factor has as many rollouts; for more of them "
                 "raise explore.episodes_per_task"
             )
-    if config.adapt.correct_steps and not config.adapt.steps:
-        raise ValueError(
-            "adapt.correct_steps is a part of adapting: set adapt.steps, too, for instance 500, or leave it 0, got "
-            f"{config.adapt.correct_steps} and adapt.steps=0"
-        )
     for setting, asked, why in (
         ("post_train.hold", bool(config.post_train.hold), "asks what greedy rollouts solved"),
-        ("adapt.correct_steps", bool(config.adapt.correct_steps), "keeps what greedy rollouts do"),
+        ("adapt.correct_steps", config.adapt.steps and config.adapt.correct_steps, "keeps what greedy rollouts do"),
     ):
         if asked and 0.0 not in config.explore.scale_factors:
             raise ValueError(

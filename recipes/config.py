@@ -155,7 +155,7 @@ class Adapt:
     lr: float = 1e-4
     correct_steps: int = 0
     """First the policy is taught where the hand has to go in the explored initial states (``correct.py``); 0 does not.
-    """
+    Like the others not read where ``steps`` is 0."""
     correct_lr: float = 5e-4
 
 
@@ -339,7 +339,7 @@ _IMPROVE = WorldEnvConfig(
     ),
     explore=Explore(episodes_per_task=480),
     reflector=Reflector(choose_threshold=True, path_epochs=20.0),
-    adapt=Adapt(steps=500),
+    adapt=Adapt(steps=500, correct_steps=1000),
     post_train=PostTrain(iterations=36, lora_rank=0, lora_lr=1e-4, head_lr=1e-4, hold=1.0),
 )
 

@@ -45,11 +45,12 @@ def probe(
     }
 
 
-def warning(target: str, iteration: int, metrics: dict[str, float]) -> str:
+def warning(target: str, source: str, iteration: int, metrics: dict[str, float]) -> str:
     return (
         f"warning: {target}, iteration {iteration}: imagined success has risen by {100 * metrics['imagined_rise']:.1f} "
         f"points since the first probes, real success by {100 * metrics['real_rise']:+.1f} (now "
         f"{100 * metrics['imagined_success']:.0f} % and {100 * metrics['real_success']:.0f} % of "
         f"{metrics['probe_episodes']} training contexts, p = {metrics['honesty_p']:.2g}): "
-        "the policy may be learning the world model's errors; training goes on"
+        "the policy may be learning the world model's errors; training goes on, if this is said to its end keep "
+        f"checkpoints/{source}"
     )

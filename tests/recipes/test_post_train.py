@@ -41,9 +41,10 @@ def test_imagined_success_that_rises_alone_is_logged_and_warned_about(monkeypatc
     logged = [probes.probe(run, None, "imagination", alarm) for _ in range(4)]
     assert [line["honesty_alarm"] for line in logged] == [0, 0, 1, 1]
     assert logged[-1]["imagined_rise"] == pytest.approx(24 / 48) and logged[-1]["probe_episodes"] == 48
-    text = probes.warning("post_train", 12, logged[-1])
+    text = probes.warning("post_train", "adapted", 12, logged[-1])
     assert "iteration 12: imagined success has risen by 50.0 points" in text
     assert "real success by +0.0 (now 92 % and 50 % of 48 training contexts" in text
+    assert text.endswith("if this is said to its end keep checkpoints/adapted")
 
 
 def test_without_a_world_model_there_is_nothing_to_distrust(monkeypatch, tmp_path):
