@@ -25,7 +25,14 @@ from holding import solved
 from run import Run
 from sft import cloning, decision_weights, lowest_heights, train
 from worldenv_trl import keys
-from worldenv_trl.data import Episodes, corrected_samples, policy_samples, until_reached, with_images
+from worldenv_trl.data import (
+    Episodes,
+    corrected_samples,
+    gripper_changes,
+    policy_samples,
+    until_reached,
+    with_images,
+)
 from worldenv_trl.policies import Policy
 
 _SHARES = (0.4, 0.4, 0.2)  # of a task: demonstrations, corrected, kept
@@ -75,6 +82,9 @@ class Corrections:
         self._episodes = everything.through(config.sft.cameras or config.cameras)
         noise = torch.tensor(factors).repeat_interleave(len(explored) // len(factors))  # as many of each
         corrected = corrected_samples(self._episodes[torch.arange(first, len(self._episodes))], noise, length)
+        where = explored[keys.TASK_ID].squeeze(-1)
+        takes = torch.isin(where[corrected["episode"]], torch.tensor(taking_tasks(explored), dtype=where.dtype))
+        corrected = corrected[takes.nonzero().squeeze(-1)]
         corrected["episode"] += first
         greedy = torch.cat([torch.zeros(first, dtype=torch.bool), noise == 0])
         kept = greedy & self._episodes["success"].any(1)
@@ -109,3 +119,11 @@ class Corrections:
     def __getitem__(self, rows: Tensor) -> TensorDictBase:
         samples: Any = self._samples[rows]
         return with_images(self._episodes, samples)
+
+
+def taking_tasks(episodes: Episodes) -> list[int]:
+    """Tasks of which at least half of the episodes that reach the goal tell the gripper otherwise: noise alone does so
+    now and then where nothing is taken hold of."""
+    reached, task = episodes["success"].any(1), episodes[keys.TASK_ID].squeeze(-1)
+    changes = gripper_changes(episodes).any(1)[reached].float()
+    return [each for each in task[reached].unique().tolist() if changes[task[reached] == each].mean() >= 0.5]

@@ -11,7 +11,7 @@ from small_run import SMALL, small_untrained
 import config
 import correct as correcting
 from checks import check_config
-from correct import Corrections, correct
+from correct import Corrections, correct, taking_tasks
 from demonstrate import demonstrate
 from episodes import explored_at
 from explore import explore
@@ -75,6 +75,22 @@ def test_each_task_has_as_many_demonstrations_as_corrections_in_a_batch_and_half
     assert counts.tolist() == pytest.approx([1 / len(TASKS)] * len(TASKS), abs=0.02)
     decides = lessons._samples[keys.NUM_STEPS][rows].squeeze(-1) % run.config.chunk_length == 0
     assert decides[shown].float().mean().item() == pytest.approx(0.5 + 0.5 / 8, abs=0.03)
+
+
+def test_noise_that_closes_a_gripper_now_and_then_corrects_nothing(run, monkeypatch):
+    def explored(run_, number, factors):
+        episodes = told(run_, number, factors)
+        other = (episodes[keys.TASK_ID].squeeze(-1) == 1).nonzero().squeeze(-1)
+        episodes["success"][other] = torch.arange(25) >= 20
+        episodes["actions"][other[1:], :, 6] = -1.0
+        return episodes
+
+    monkeypatch.setattr(correcting, "explored_at", explored)
+    episodes = until_reached(explored(run, 1, [0.0, 1.0]))
+    all_of_them = corrected_samples(episodes, torch.zeros(len(episodes)))["episode"]
+    assert episodes[keys.TASK_ID][all_of_them].unique().tolist() == [0, 1]
+    assert taking_tasks(episodes) == [0]
+    assert Corrections(run, 1).tasks == {0}
 
 
 def test_a_lesson_shows_what_was_seen_there(run):
@@ -151,6 +167,6 @@ def test_only_scales_that_loop_does_not_exceed_are_asked(run, monkeypatch):
 
 
 def test_without_greedy_exploration_it_is_refused_before_any_work_but_not_where_nothing_is_adapted():
-    with pytest.raises(ValueError, match="keeps what greedy rollouts do: explore.scale_factors must hold 0, got 1"):
+    with pytest.raises(ValueError, match=r"keeps what greedy rollouts do: explore.scale_factors must hold 0, got 1"):
         check_config(dataclasses.replace(SMALL, adapt=config.Adapt(steps=1, correct_steps=5)))
     check_config(dataclasses.replace(SMALL, adapt=config.Adapt(steps=0, correct_steps=5)))

@@ -8,7 +8,7 @@ from worldenv_trl.data.imagine import ImaginedSoFar, imagine_episodes
 from worldenv_trl.data.lerobot import write_lerobot
 from worldenv_trl.data.lerobot_reader import read_lerobot
 from worldenv_trl.data.libero import ACTIONS, LiberoFile, inspect_libero, read_libero
-from worldenv_trl.data.samples import policy_samples, with_images
+from worldenv_trl.data.samples import gripper_changes, policy_samples, with_images
 from worldenv_trl.data.score import score_episodes
 from worldenv_trl.data.store import fill_store, open_store
 from worldenv_trl.data.windows import WindowBuffer, WindowSampler, predicted_poses, window_buffer
@@ -23,6 +23,7 @@ __all__ = [
     "corrected_samples",
     "episodes_from_rollouts",
     "fill_store",
+    "gripper_changes",
     "hdf5_to_mcap",
     "imagine_episodes",
     "inspect_libero",
