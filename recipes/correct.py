@@ -11,7 +11,6 @@ Part of the stage ``adapt``, before the world model's frames are shown.
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import torch
@@ -40,21 +39,19 @@ _SHARES = (0.4, 0.4, 0.2)  # of a task: demonstrations, corrected, kept
 
 def correct(run: Run, policy: Policy, parameters: list[Parameter], models: str) -> None:
     """``adapt.correct_steps`` updates of a policy's ``parameters`` by what a round explored; none where every task in
-    which the gripper opens or closes is solved."""
+    which the gripper opens or closes is solved, or there is none: that is printed."""
     settings = run.config.adapt
     if not settings.correct_steps:
         return
     lessons = Corrections(run, round_of(models))
+    nothing = ""
     if not lessons.tasks:
-        warnings.warn(
-            "nothing is corrected: no explored rollout that reaches its goal tells where a thing is taken hold of; "
-            "more of them may (--explore.episodes-per-task), or those of a policy of more demonstrations",
-            stacklevel=2,
-        )
-        return
-    if lessons.tasks <= set(solved(run, models)[1]):
+        nothing = "no explored rollout that reaches its goal opens or closes the gripper"
+    elif lessons.tasks <= set(solved(run, models)[1]):
+        nothing = "every task whose successes open or close the gripper is solved"
+    if nothing:
         if processes.is_main():
-            print("adapt: nothing to correct, every task whose successes open or close the gripper is solved")
+            print(f"adapt: nothing to correct, {nothing}")
         return
     if processes.is_main():
         print(f"adapt: corrected from {lessons.told} initial states, {len(lessons)} samples")
