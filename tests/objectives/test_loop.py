@@ -91,16 +91,13 @@ def test_a_chunk_that_is_displaced_as_a_whole_has_one_ratio_already():
         loss(make_batch(noise="chunk"))
 
 
-@pytest.mark.parametrize(("sampled", "scored"), [("chunk", "step"), ("step", "chunk")])
 @pytest.mark.parametrize("events", [0, 1])
-def test_a_density_other_than_the_one_that_was_sampled_from_is_refused(sampled, scored, events):
-    batch = make_batch(events, noise=sampled)
+def test_steps_that_were_sampled_one_by_one_are_not_scored_as_a_whole_chunk(events):
+    batch = make_batch(events, noise="chunk")
     batch[keys.LOG_PROBS][~batch[keys.MASK]] = math.nan  # nobody's
-    LOOPLoss(make_actor(events, noise=sampled))(batch)
-    with pytest.raises(
-        ValueError, match=r"log_probs'.* are not of the density .*: collect and train with the same noise"
-    ):
-        LOOPLoss(make_actor(events, noise=scored))(batch)
+    LOOPLoss(make_actor(events, noise="chunk"))(batch)
+    with pytest.raises(ValueError, match="differ from step to step, those of ChunkLaplace do not: collect and train"):
+        LOOPLoss(make_actor(events, noise="chunk"))(make_batch(events))
 
 
 def test_per_dimension_log_probs_also_serve_step_ratios():

@@ -288,10 +288,10 @@ class LOOPLoss(LossModule):
                 f"{names.sample_log_prob} is {list(before.shape)}, the actor scores {list(now.shape)}: "
                 "collect and train with the same event_dims"
             )
-        if not whole and _of_other_noise(before, now, steps, getattr(distribution, "whole_chunks", False)):
+        if getattr(distribution, "whole_chunks", False) and _of_single_steps(before, steps):
             raise ValueError(
-                f"{names.sample_log_prob} are not of the density that {type(distribution).__name__} is: collect and "
-                "train with the same noise (policies.laplace_actor)"
+                f"{names.sample_log_prob} differ from step to step, those of {type(distribution).__name__} do not: "
+                "collect and train with the same noise (policies.laplace_actor)"
             )
         if whole:
             return distribution, *self._whole_log_ratio(now - before, executed & ~padding, steps, advantage)
@@ -372,11 +372,10 @@ class LOOPLoss(LossModule):
         }
 
 
-def _of_other_noise(before: Tensor, now: Tensor, steps: Tensor, whole_chunks: bool) -> bool:
-    """Whether log-probs [*B, C] or [*B, C, 7] tell that their chunks were sampled otherwise than the actor samples:
-    whole ones have the same number at every step, others do not."""
-    if steps.shape[-1] < 2 or before.ndim < steps.ndim or torch.compiler.is_compiling():
+def _of_single_steps(log_probs: Tensor, steps: Tensor) -> bool:
+    """Whether log-probs [*B, C] or [*B, C, 7] were not written by a density of whole chunks, which has the same number
+    at every step."""
+    if steps.shape[-1] < 2 or log_probs.ndim < steps.ndim or torch.compiler.is_compiling():
         return False
-    counted = steps.any(-1)  # others may hold anything
-    alike = [bool((each == each[:, :1]).all()) for each in (before[counted], now.detach()[counted])]
-    return not alike[0] if whole_chunks else alike == [True, False] and bool((before[counted] != 0).any())
+    counted = log_probs[steps.any(-1)]  # others may hold anything
+    return not bool((counted == counted[:, :1]).all())
