@@ -21,7 +21,7 @@ from torch import Tensor
 import processes
 from correct import correct
 from data_parallel import DataParallel, WholeOptimizer
-from episodes import explored_at, round_of
+from episodes import explored_at, quiet_factors, round_of
 from holding import all_held
 from imagining import imagined
 from physics import exploring_actor
@@ -84,9 +84,7 @@ def adapt(run: Run, source: str = "sft", target: str = "adapted", models: str = 
 def sampled_as_in_loop(run: Run, number: int) -> Episodes:
     """``adapt.episodes_per_task`` explored episodes of each task, or all there are: drawn from the scales that LOOP's
     does not exceed, or from all if there is none."""
-    explore, wanted = run.config.explore, run.config.post_train.scale_factor
-    usual = [factor for factor in explore.scale_factors if factor <= wanted] or explore.scale_factors
-    pool = explored_at(run, number, usual)
+    pool = explored_at(run, number, quiet_factors(run.config) or run.config.explore.scale_factors)
     tasks = pool[keys.TASK_ID].squeeze(-1)
     chosen = []
     for task in tasks.unique():

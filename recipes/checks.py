@@ -116,21 +116,18 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             raise ValueError(f"{name} must be at least {len(config.tasks)}, one for each task, got {rows}")
     if not config.explore.scale_factors:
         raise ValueError("explore.scale_factors is empty: name at least one, for instance 1")
-    for factor in config.explore.scale_factors:
-        if config.explore.scale_factors.count(factor) > 1:
-            raise ValueError(
-                f"explore.scale_factors names {factor:g} twice: each factor has as many rollouts; for more of them "
-                "raise explore.episodes_per_task"
-            )
+    factors = ", ".join(f"{factor:g}" for factor in config.explore.scale_factors)
+    if len(set(config.explore.scale_factors)) < len(config.explore.scale_factors):
+        raise ValueError(
+            f"explore.scale_factors names a factor twice, {factors}: each has as many rollouts; for more of them raise "
+            "explore.episodes_per_task"
+        )
     for setting, asked, why in (
         ("post_train.hold", bool(config.post_train.hold), "asks what greedy rollouts solved"),
         ("adapt.correct_steps", config.adapt.steps and config.adapt.correct_steps, "keeps what greedy rollouts do"),
     ):
         if asked and 0.0 not in config.explore.scale_factors:
-            raise ValueError(
-                f"{setting} {why}: explore.scale_factors must hold 0, got "
-                f"{', '.join(f'{factor:g}' for factor in config.explore.scale_factors)}"
-            )
+            raise ValueError(f"{setting} {why}: explore.scale_factors must hold 0, got {factors}")
     if config.post_train.env == "tabletop":
         for name, count, least in (("adapt.steps", config.adapt.steps, 0), ("rounds", config.rounds, 1)):
             if count > least:

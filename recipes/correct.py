@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 import processes
-from episodes import explored_at, recorded_episodes, round_of
+from episodes import explored_at, quiet_factors, recorded_episodes, round_of
 from holding import solved
 from run import Run
 from sft import cloning, decision_weights, lowest_heights, train
@@ -72,17 +72,16 @@ class Corrections:
 
     def __init__(self, run: Run, number: int) -> None:
         config, length = run.config, run.config.chunk_length
-        factors = [factor for factor in config.explore.scale_factors if factor <= config.post_train.scale_factor]
+        factors = quiet_factors(config)
         explored = until_reached(explored_at(run, number, factors))
         demonstrated = recorded_episodes(run, number)[0]
         everything, first = Episodes.cat([demonstrated, explored]), len(demonstrated)
         self._episodes = everything.through(config.sft.cameras or config.cameras)
         noise = torch.tensor(factors).repeat_interleave(len(explored) // len(factors))  # as many of each
-        corrected = corrected_samples(self._episodes[torch.arange(first, len(self._episodes))], noise, length)
-        where = explored[keys.TASK_ID].squeeze(-1)
-        takes = torch.isin(where[corrected["episode"]], torch.tensor(taking_tasks(explored), dtype=where.dtype))
-        corrected = corrected[takes.nonzero().squeeze(-1)]
-        corrected["episode"] += first
+        task = explored[keys.TASK_ID].squeeze(-1)
+        rows = torch.isin(task, torch.tensor(taking_tasks(explored), dtype=task.dtype)).nonzero().squeeze(-1)
+        corrected = corrected_samples(self._episodes[first + rows], noise[rows], length)
+        corrected["episode"] = first + rows[corrected["episode"]]
         greedy = torch.cat([torch.zeros(first, dtype=torch.bool), noise == 0])
         kept = greedy & self._episodes["success"].any(1)
         parts = [self._all(torch.arange(len(kept)) < first, length), corrected]

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 import torch
 
 import processes
+from config import WorldEnvConfig
 from explore import rows_of_scale
 from run import Run
 from worldenv_trl import keys
@@ -54,6 +55,11 @@ def explored_at(run: Run, number: int, factors: Iterable[float]) -> Episodes:
     rows = torch.arange(len(explored))
     tasks = len(run.config.tasks)
     return explored[torch.cat([rows[rows_of_scale(run.config.explore, tasks, factor)] for factor in factors])]
+
+
+def quiet_factors(config: WorldEnvConfig) -> list[float]:
+    """The factors of exploration's scale that LOOP's does not exceed."""
+    return [factor for factor in config.explore.scale_factors if factor <= config.post_train.scale_factor]
 
 
 def split_by_context(episodes: Episodes, share: float, seed: int) -> tuple[Episodes, Episodes]:

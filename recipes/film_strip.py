@@ -55,7 +55,7 @@ def main(settings: Settings) -> None:
         run = Run(config, RunFolder(settings.run))
         models = run.world_model(), run.reflector(), run.rules()
         actor = policy_actor(run.policy(settings.policy).eval())
-        worlds = imagine(run, *models, live(run, actor, range(settings.state, settings.state + 1)))
+        worlds = imagine(run, *models, live(run, actor, [settings.state]))
     draw(worlds, config.tasks, settings.columns, out)
     print(f"{out}: {out.stat().st_size / 1e3:,.0f} kB")
 

@@ -51,6 +51,6 @@ def warning(target: str, source: str, iteration: int, metrics: dict[str, float])
         f"points since the first probes, real success by {100 * metrics['real_rise']:+.1f} (now "
         f"{100 * metrics['imagined_success']:.0f} % and {100 * metrics['real_success']:.0f} % of "
         f"{metrics['probe_episodes']} training contexts, p = {metrics['honesty_p']:.2g}): "
-        "the policy may be learning the world model's errors; training goes on, if this is said to its end keep "
-        f"checkpoints/{source}"
+        "the policy may be learning the world model's errors; training goes on; where this is "
+        f"still said at its end keep checkpoints/{source}"
     )

@@ -162,6 +162,8 @@ def open_run(config: WorldEnvConfig, parts: Parts | None = None) -> Run:
 
 def _check_and_open(config: WorldEnvConfig, parts: Parts, folder: RunFolder, count: int) -> None:
     check_config(config, parts)
+    if config.adapt.correct_steps and not config.adapt.steps:
+        _warn(f"adapt.correct_steps={config.adapt.correct_steps} is not read: adapt.steps is 0")
     check_shares(config, count)
     check_made_of(plan(config), parts, folder)
     begun = beginning(config, plan(config), folder)

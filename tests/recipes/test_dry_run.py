@@ -12,6 +12,7 @@ import dry_run as dry
 import world_env
 from parts import COMPACT, make_policy, make_reflector
 from rehearsal import rehearse
+from stage_plan import Machine
 from stages import open_run
 from worldenv_trl import keys
 
@@ -21,6 +22,11 @@ def test_its_options_stand_anywhere_among_the_settings():
     assert settings == ["smoke", "--seed", "3"]
     assert (chosen.gpus, chosen.gpu, chosen.matmul_share) == (2, None, 0.4)
     assert dry.split(["smoke", "--seed", "3"]) == (None, ["smoke", "--seed", "3"])
+
+
+def test_a_slow_machine_has_a_speed(capsys):
+    dry._show_stages([], Machine("CPU", "cpu", gpus=1, flops=2e10, memory=8e9, share=0.5))
+    assert "1 x CPU (20.0 GFLOP/s and 8.0 GB each)" in capsys.readouterr().out
 
 
 def test_a_preset_is_planned_in_its_order_and_no_folder_is_touched(tmp_path, capsys):

@@ -44,7 +44,7 @@ def test_imagined_success_that_rises_alone_is_logged_and_warned_about(monkeypatc
     text = probes.warning("post_train", "adapted", 12, logged[-1])
     assert "iteration 12: imagined success has risen by 50.0 points" in text
     assert "real success by +0.0 (now 92 % and 50 % of 48 training contexts" in text
-    assert text.endswith("if this is said to its end keep checkpoints/adapted")
+    assert text.endswith("training goes on; where this is still said at its end keep checkpoints/adapted")
 
 
 def test_without_a_world_model_there_is_nothing_to_distrust(monkeypatch, tmp_path):

@@ -59,7 +59,7 @@ def test_later_rounds_start_from_the_policy_of_the_round_before():
         ({"demonstrate": Demonstrate(51, states="spread")}, "demonstrate.episodes_per_task must be at most 50, train_"),
         ({"demonstrate": Demonstrate(episodes_per_task=0)}, "demonstrate.episodes_per_task must be at least 1"),
         ({"explore": Explore(scale_factors=())}, "explore.scale_factors"),
-        ({"explore": Explore(scale_factors=(0.0, 1.0, 0.0))}, "explore.scale_factors names 0 twice"),
+        ({"explore": Explore(scale_factors=(0.0, 1.0, 0.0))}, "explore.scale_factors names a factor twice, 0, 1, 0"),
         (
             {"post_train": PostTrain(env="tabletop"), "adapt": Adapt(steps=10)},
             "adapt.steps is of imagination: it must be 0 where post_train.env is tabletop, got 10",

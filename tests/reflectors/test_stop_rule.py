@@ -56,7 +56,7 @@ def test_the_first_frame_never_stops_and_a_score_at_the_threshold_does_not():
     assert StopRule(0.5).first(torch.tensor([[0.9], [0.9]]), alive[:, :1]).tolist() == [-1, -1]
 
 
-@pytest.mark.parametrize("settings", [(0.0, 1), (1.0, 1), (float("nan"), 1), (0.5, 0), (0.5, 1.5)])
+@pytest.mark.parametrize("settings", [(0.0, 1), (1.0, 1), (float("nan"), 1), (0.5, 0), (0.5, 1.5), (0.5, float("nan"))])
 def test_rules_out_of_range_are_refused(settings):
     with pytest.raises(ValueError, match="got"):
         StopRule(*settings)

@@ -78,7 +78,8 @@ class LOOPLoss(LossModule):
         functional: False keeps the actor's parameters in the actor (needed for adapters injected by peft, and FSDP).
 
     Raises:
-        ValueError: for a setting out of range, or entries whose shapes do not match.
+        ValueError: for a setting out of range, entries whose shapes do not match, or log-probs of single steps where
+            the actor's are of whole chunks.
 
     Examples:
         >>> import torch
@@ -281,17 +282,17 @@ class LOOPLoss(LossModule):
                     f'ratio_level="chunk" would take the ratio of a chunk once for each step: '
                     f'{type(distribution).__name__} has that of the chunk at every step, use "step"'
                 )
+            if _of_single_steps(before, steps):
+                raise ValueError(
+                    f"{names.sample_log_prob} differ from step to step, those of {type(distribution).__name__} do not: "
+                    "collect and train with the same noise (policies.laplace_actor)"
+                )
             taken = torch.where(executed.any(-2, keepdim=True), chunk, torch.zeros_like(chunk))
         now = distribution.log_prob(taken)
         if now.shape != before.shape:
             raise ValueError(
                 f"{names.sample_log_prob} is {list(before.shape)}, the actor scores {list(now.shape)}: "
                 "collect and train with the same event_dims"
-            )
-        if getattr(distribution, "whole_chunks", False) and _of_single_steps(before, steps):
-            raise ValueError(
-                f"{names.sample_log_prob} differ from step to step, those of {type(distribution).__name__} do not: "
-                "collect and train with the same noise (policies.laplace_actor)"
             )
         if whole:
             return distribution, *self._whole_log_ratio(now - before, executed & ~padding, steps, advantage)

@@ -26,7 +26,7 @@ def rloo_advantage(returns: Tensor) -> Tensor:
         raise ValueError(
             f"leave-one-out needs at least 2 rollouts in a group, got returns of shape {list(returns.shape)}"
         )
-    if not returns.isfinite().all():
-        raise ValueError(f"returns must be finite, {int((~returns.isfinite()).sum())} of {returns.numel()} are not")
+    if unknown := int((~returns.isfinite()).sum()):
+        raise ValueError(f"returns must be finite, {unknown} of {returns.numel()} are not")
     n = returns.shape[-1]
     return (returns - returns.mean(-1, keepdim=True)) * (n / (n - 1))

@@ -38,7 +38,7 @@ class StopRule:
     def __post_init__(self) -> None:
         if not 0 < self.threshold < 1:
             raise ValueError(f"threshold must be in (0, 1), got {self.threshold}")
-        if self.consecutive < 1 or self.consecutive != int(self.consecutive):
+        if self.consecutive < 1 or not float(self.consecutive).is_integer():
             raise ValueError(f"consecutive must be a whole number, at least 1, got {self.consecutive}")
 
     def extend(self, streak: Tensor, scores: Tensor, executed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
