@@ -20,7 +20,7 @@ from torch.nn import Parameter
 
 import processes
 from episodes import explored_at, quiet_factors, recorded_episodes, round_of
-from holding import solved
+from holding import solved_tasks
 from run import Run
 from sft import cloning, decision_weights, lowest_heights, train
 from worldenv_trl import keys
@@ -47,7 +47,7 @@ def correct(run: Run, policy: Policy, parameters: list[Parameter], models: str) 
     nothing = ""
     if not lessons.tasks:
         nothing = "no explored rollout that reaches its goal opens or closes the gripper"
-    elif lessons.tasks <= set(solved(run, models)[1]):
+    elif lessons.tasks <= set(solved_tasks(run, models)):
         nothing = "every task whose successes open or close the gripper is solved"
     if nothing:
         if processes.is_main():

@@ -38,7 +38,8 @@ class Hold:
     def __init__(self, run: Run, source: str, models: str) -> None:
         policy = run.policy(source).eval()
         self._actor = exploring_actor(run.config, policy, run.config.post_train.scale_factor)
-        shares, held = solved(run, models)
+        shares = greedy_shares(run, models)
+        held = _enough(run, shares)
         self._tasks, self.everything = torch.tensor(held, dtype=torch.long), len(held) == len(run.config.tasks)
         if self.everything:
             warnings.warn(
@@ -75,13 +76,21 @@ class Hold:
 
 def all_held(run: Run, models: str) -> bool:
     """Whether LOOP holds every task of a round, so that there is nothing to learn and the policy stays as it is."""
-    return bool(run.config.post_train.hold) and len(solved(run, models)[1]) == len(run.config.tasks)
+    return bool(run.config.post_train.hold) and len(solved_tasks(run, models)) == len(run.config.tasks)
 
 
-def solved(run: Run, models: str) -> tuple[dict[int, float], list[int]]:
-    """What greedy exploration solved of each task, and the tasks of which that is enough to hold them."""
-    shares = solved_shares(explored_at(run, round_of(models), [0.0]))
-    return shares, [task for task, share in shares.items() if share >= run.config.post_train.hold_from]
+def solved_tasks(run: Run, models: str) -> list[int]:
+    """The tasks of which greedy exploration solved enough to hold them."""
+    return _enough(run, greedy_shares(run, models))
+
+
+def greedy_shares(run: Run, models: str) -> dict[int, float]:
+    """What greedy exploration solved of each task."""
+    return solved_shares(explored_at(run, round_of(models), [0.0]))
+
+
+def _enough(run: Run, shares: dict[int, float]) -> list[int]:
+    return [task for task, share in shares.items() if share >= run.config.post_train.hold_from]
 
 
 def solved_shares(episodes: Episodes) -> dict[int, float]:

@@ -59,7 +59,7 @@ def failing(episodes):
 @pytest.fixture
 def run(explored_run, monkeypatch):
     monkeypatch.setattr(correcting, "explored_at", told)
-    monkeypatch.setattr(correcting, "solved", lambda *_: ({}, []))
+    monkeypatch.setattr(correcting, "solved_tasks", lambda *_: [])
     return explored_run
 
 
@@ -138,7 +138,7 @@ def test_the_policy_goes_where_it_was_told(run, monkeypatch):
 def test_nothing_is_learned_where_all_that_could_be_corrected_is_solved(run, monkeypatch, capsys):
     policy = run.policy("sft").eval()
     before = {name: value.clone() for name, value in policy.state_dict().items()}
-    monkeypatch.setattr(correcting, "solved", lambda *_: ({0: 0.9}, [0]))
+    monkeypatch.setattr(correcting, "solved_tasks", lambda *_: [0])
     correct(run, policy, parameters_of(policy), "")
     assert "nothing to correct" in capsys.readouterr().out
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
