@@ -25,7 +25,7 @@ _ANYWHERE = FREE | {"rounds"}  # later rounds leave the earlier ones as they are
 DEPENDS_ON: dict[str, tuple[str, ...]] = {
     "demonstrate": ("demonstrate",),
     "sft": ("sft", "real_size"),
-    "explore": ("explore", "scale_floor", "scale_share", "noise", "post_train.ratio_level"),
+    "explore": ("explore", "scale_floor", "scale_share", "post_train.ratio_level"),
     "train_world_model": ("world_model",),
     "train_reflector": ("reflector",),
     "adapt": (
@@ -35,7 +35,7 @@ DEPENDS_ON: dict[str, tuple[str, ...]] = {
         "post_train.lora_rank",
         "post_train.scale_factor",
     ),
-    "post_train": ("adapt", "post_train", "scale_floor", "scale_share", "noise", "evaluate.num_envs"),
+    "post_train": ("adapt", "post_train", "scale_floor", "scale_share", "evaluate.num_envs"),
 }
 """Settings, or sections of them, that a kind of stage depends on besides those of the stages before it and those of the
 whole run: its tasks, seed, cameras and so on."""

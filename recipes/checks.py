@@ -48,9 +48,10 @@ def check_loop(config: WorldEnvConfig, policy: Policy) -> None:
             f"post_train.ratio_level must be step or chunk for {type(policy).__name__}, which does not act by tokens, "
             "got 'token'"
         )
-    if level == "chunk" and config.noise == "chunk" and not isinstance(policy, TokenPolicy):
+    if level == "chunk" and config.post_train.noise == "chunk" and not isinstance(policy, TokenPolicy):
         raise ValueError(
-            "post_train.ratio_level must be step with noise='chunk', where each step has its chunk's ratio, got 'chunk'"
+            "post_train.ratio_level must be step with post_train.noise='chunk', where each step has its chunk's ratio, "
+            "got 'chunk'"
         )
     for name, value in (("post_train.hold", config.post_train.hold), ("adapt.steps", config.adapt.steps)):
         if isinstance(policy, TokenPolicy) and value:
@@ -79,7 +80,8 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     for name, value, known in (
         ("post_train.env", config.post_train.env, ("imagined", "tabletop")),
         ("post_train.ratio_level", config.post_train.ratio_level, ("step", "chunk", "token")),
-        ("noise", config.noise, tuple(NOISES)),
+        ("explore.noise", config.explore.noise, tuple(NOISES)),
+        ("post_train.noise", config.post_train.noise, tuple(NOISES)),
         ("parallel", config.parallel, MODES),
         ("demonstrate.actions", config.demonstrate.actions, ACTIONS),
         ("demonstrate.states", config.demonstrate.states, ("first", "spread")),

@@ -88,6 +88,8 @@ class Explore:
     scale_factors: tuple[float, ...] = (0.0, 0.5, 1.0, 2.0)
     """Multiples of the policy's Laplace scale, or of its temperature if it acts by tokens; the episodes are shared out
     equally. 0 is the greedy policy."""
+    noise: str = "step"
+    """As ``post_train.noise``. LOOP may have another one than the models were shown."""
     num_envs: int = 32
 
 
@@ -191,6 +193,10 @@ class PostTrain:
     solves; their returns are not learned from. At 0 nothing is held."""
     hold_from: float = 0.85
     """A task is solved if this share of its greedy rollouts in exploration reached the goal."""
+    noise: str = "step"
+    """Of the Laplace density that is sampled and scored: ``step``, each step's own (World-Env Eq. 2), or ``chunk``, one
+    displacement for all steps of a chunk, whose ratio each of them has (``policies.ChunkLaplace``). Policies that act
+    by tokens have none."""
     scale_factor: float = 1.0
     """Behaviour and scored density use this multiple of the policy's scale, or of its temperature if it acts by tokens.
     """
@@ -304,10 +310,6 @@ class WorldEnvConfig:
 
     Where they turn the hand, noise that suits rotations they never use is so small that the smallest update exceeds
     ``post_train.max_kl``."""
-    noise: str = "step"
-    """Of the Laplace density that explores, and that LOOP samples and scores: ``step``, each step's own (World-Env
-    Eq. 2), or ``chunk``, one displacement for all steps of a chunk, whose ratio each of them has
-    (``policies.ChunkLaplace``). Policies that act by tokens have none."""
     train_states: int = 50
     """Training initial states of each task that exploration starts from, and LOOP after it. 50 is the standard; another
     one costs a rollout of exploration, no demonstration."""

@@ -64,7 +64,7 @@ def dreamt_groups(
 def _dream(run: Run, policy: Policy, world_model: WorldModel, groups: RealGroups, draw: Draw, path: Path) -> None:
     torch.manual_seed(stage_seed(draw.seed, "dreamt groups"))
     config, size = run.config, draw.group_size
-    actor = DeviceBridge(exploring_actor(config, policy.eval(), draw.scale_factor))
+    actor = DeviceBridge(exploring_actor(config, policy.eval(), draw.scale_factor, draw.noise))
     firsts = torch.arange(0, len(groups.episodes), size)
     with ExitStack() as stack:
         writer: RolloutWriter | None = None

@@ -34,7 +34,8 @@ def explore(run: Run, policy: str = "sft", target: str = "explore") -> None:
     about = partial(recording, config, env, target, {"policy": model}, policy=policy)
     with ResumableRecording(folder.rollouts(target), about) as recorded:
         for number, factor in enumerate(settings.scale_factors):
-            player = chunk_player(exploring_actor(config, model, max(factor, 1e-6)), config.chunk_length)
+            actor = exploring_actor(config, model, max(factor, 1e-6), settings.noise)
+            player = chunk_player(actor, config.chunk_length)
             collector = run.group_collector(
                 env,
                 player,

@@ -76,13 +76,14 @@ def chunk_player(actor: LaplaceActor | AutoregressiveActor, chunk_length: int) -
     return MultiStepActorWrapper(DeviceBridge(actor), n_steps=chunk_length)
 
 
-def exploring_actor(config: WorldEnvConfig, policy: Policy, scale_factor: float) -> LaplaceActor | AutoregressiveActor:
-    """The stochastic actor of exploration and LOOP, a Laplace scale bounded below."""
+def exploring_actor(
+    config: WorldEnvConfig, policy: Policy, scale_factor: float, noise: str = "step"
+) -> LaplaceActor | AutoregressiveActor:
+    """The stochastic actor of exploration and LOOP, a Laplace scale bounded below. Mean and scale are of single steps
+    whatever the ``noise``."""
     bounds = scale_bounds(policy, config.scale_floor, share=config.scale_share)
     events = 0 if config.post_train.ratio_level == "token" else 1
-    return policy_actor(
-        policy, scale_factor=scale_factor, log_scale_bounds=bounds, event_dims=events, noise=config.noise
-    )
+    return policy_actor(policy, scale_factor=scale_factor, log_scale_bounds=bounds, event_dims=events, noise=noise)
 
 
 def reached_goal(rollouts: TensorDictBase) -> torch.Tensor:

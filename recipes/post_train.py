@@ -71,7 +71,7 @@ def post_train(
     for name in [name for name, rate in rates.items() if not rate]:
         for parameter in groups.pop(name):
             parameter.requires_grad_(False)
-    actor = exploring_actor(config, policy, settings.scale_factor)
+    actor = exploring_actor(config, policy, settings.scale_factor, settings.noise)
 
     waves = Waves(run, target, models, actor)
     imagination = waves.imagination
@@ -79,7 +79,7 @@ def post_train(
     read += [key for key in (keys.TOKEN_IS_PAD,) if key in actor.out_keys]
 
     def make_loss(part: Policy) -> LOOPLoss:
-        scored = actor if part is policy else exploring_actor(config, part, settings.scale_factor)
+        scored = actor if part is policy else exploring_actor(config, part, settings.scale_factor, settings.noise)
         loss = LOOPLoss(
             scored,
             clip_epsilon=settings.clip_epsilon,

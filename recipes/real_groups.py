@@ -38,6 +38,8 @@ class Draw:
     """N, rollouts of each."""
     scale_factor: float
     """Multiple of the policy's scale that is sampled with."""
+    noise: str
+    """What is drawn by itself: ``step`` or ``chunk``."""
     seed: int
 
 
@@ -154,7 +156,8 @@ def _live(run: Run, policy: Policy, draw: Draw, path: Path) -> None:
     """Draws the groups: LOOP's behaviour policy, in the physics."""
     config = run.config
     torch.manual_seed(stage_seed(draw.seed, "groups"))
-    player = chunk_player(exploring_actor(config, policy.eval(), draw.scale_factor), config.chunk_length)
+    actor = exploring_actor(config, policy.eval(), draw.scale_factor, draw.noise)
+    player = chunk_player(actor, config.chunk_length)
     per_task, at_once = draw.contexts // len(config.tasks), max(1, _ROWS // draw.group_size)
     # Spread over all states: the first ones are the demonstrations' own.
     indices = torch.linspace(0, config.train_states - 1, per_task).long().split(at_once)

@@ -79,7 +79,7 @@ def main(options: Options, parts: Parts = COMPACT) -> int:
     policy = None
     if options.policy is not None:
         acting = _checkpoint(parts.policy, options.policy, options.file, metadata, "policy").to(device)
-        policy = recorded_actor(acting, metadata.get("config", {}))
+        policy = recorded_actor(acting, metadata)
     edits: dict[int, dict[int, float]] = {}
     for text in options.edit:
         for step, values in parse_edit(text).items():
@@ -113,13 +113,16 @@ def main(options: Options, parts: Parts = COMPACT) -> int:
     return 0
 
 
-def recorded_actor(policy: Policy, settings: Mapping[str, Any]) -> LaplaceActor | AutoregressiveActor:
-    """The policy with the noise of exploration and LOOP, as the ``settings`` of a recording's run have it; with its own
-    trained scale where there are none."""
+def recorded_actor(policy: Policy, metadata: Mapping[str, Any]) -> LaplaceActor | AutoregressiveActor:
+    """The policy with the noise of exploration, or of LOOP, as the settings in a recording's ``metadata`` have it; with
+    its own trained scale where there are none."""
+    settings = metadata.get("config", {})
     if "scale_floor" not in settings:
         return policy_actor(policy)
     bounds = scale_bounds(policy, tuple(settings["scale_floor"]), share=settings["scale_share"])
-    factor, noise = settings["post_train"]["scale_factor"], settings.get("noise", "step")
+    section = settings["explore" if metadata.get("stage", "").startswith("explore") else "post_train"]
+    noise = section.get("noise", settings.get("noise", "step"))  # once it was one setting of both
+    factor = settings["post_train"]["scale_factor"]
     return policy_actor(policy, scale_factor=factor, log_scale_bounds=bounds, noise=noise)
 
 

@@ -42,7 +42,7 @@ FREE = {
 }
 """Settings of the machine at hand, and where a run began: it may be continued with others. Only ``device`` and
 ``collectors`` (``local`` or shares, and how many) change noise and rounding."""
-_IDLE = {"explore.replay_shift_m": 0.08, "post_train.held_share": 1.0}
+_IDLE = {"explore.replay_shift_m": 0.08, "post_train.held_share": 1.0, "noise": "step"}
 """Of settings that are gone: values at which they did nothing although they read as if they did."""
 
 

@@ -71,7 +71,7 @@ def main(settings: Settings) -> list[tuple[str, Tensor]]:
         config = dataclasses.replace(config, post_train=sampled)
         run = Run(config, RunFolder(settings.run))
         policy = run.policy(settings.policy).eval()
-        actor = exploring_actor(config, policy, factor)
+        actor = exploring_actor(config, policy, factor, sampled.noise)
         if not isinstance(actor, LaplaceActor):
             raise ValueError(f"{type(policy).__name__} acts by tokens: directions are measured of Laplace policies")
     models = model_hash(policy)[:8]

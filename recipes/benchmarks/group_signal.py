@@ -109,7 +109,7 @@ def main(settings: Settings) -> Path:
         config = read_config(RunRecord.read(settings.run), settings.num_threads, settings.device)
         run = Run(config, RunFolder(settings.run))
         factor = config.post_train.scale_factor if settings.scale_factor is None else settings.scale_factor
-        draw = Draw(settings.contexts, settings.group_size, factor, settings.seed)
+        draw = Draw(settings.contexts, settings.group_size, factor, config.post_train.noise, settings.seed)
         check_draw(run, draw)
         paths = {
             "policy": run.folder.named_checkpoint(settings.policy, "sft"),

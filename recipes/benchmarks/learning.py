@@ -85,7 +85,7 @@ class Measured:
         config, sampled = self.run.config, self.settings.sampled
         actors = {"greedy": (policy_actor(policy), ExplorationType.DETERMINISTIC)}
         if sampled:
-            actor = exploring_actor(config, policy, config.post_train.scale_factor)
+            actor = exploring_actor(config, policy, config.post_train.scale_factor, config.post_train.noise)
             actors["sampled"] = (actor, ExplorationType.RANDOM)
         for split, indices in self.states.items():
             for mode, (actor, exploration_type) in actors.items():

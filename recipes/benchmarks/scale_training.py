@@ -110,7 +110,7 @@ def _loop(settings: Settings, run: Run, imagination: Imagination) -> None:
     learned = dataclasses.replace(run.config.post_train, max_kl=math.inf, epochs=1)
     policy = COMPACT.policy.make(run.config).to(run.device)
     groups = policy.post_training_parameters(learned.lora_rank)
-    actor = exploring_actor(run.config, policy, learned.scale_factor)
+    actor = exploring_actor(run.config, policy, learned.scale_factor, learned.noise)
     mine = settings.groups // processes.size()
     env = imagination.env(run, [mine, settings.group_size], seed=0)
     collector = GroupCollector(env, actor, groups_per_batch=mine)

@@ -204,7 +204,7 @@ def _loop(settings: Benchmark, run: Run, env: EnvBase, policy: Policy, timed: _T
     """Imagined rollouts, and whole iterations of LOOP; both beside what the device's matrix products allow."""
     learned = dataclasses.replace(run.config.post_train, max_kl=math.inf)  # the policy is untrained: it may move far
     groups = policy.post_training_parameters(learned.lora_rank)
-    actor = exploring_actor(run.config, policy, learned.scale_factor)
+    actor = exploring_actor(run.config, policy, learned.scale_factor, learned.noise)
     collector = GroupCollector(env, actor, groups_per_batch=settings.groups)
     collector.exclude = [("next", "observation")]
     loss = LOOPLoss(actor, clip_epsilon=learned.clip_epsilon, functional=False)

@@ -100,7 +100,7 @@ def test_a_stage_reads_no_setting_that_could_change_unnoticed(whole):
         ({"sft__steps": 4}, "demonstrate"),
         ({"explore__episodes_per_task": 9}, "sft"),
         ({"scale_floor": (0.1, 0.1, 0.1)}, "sft"),
-        ({"noise": "chunk"}, "sft"),
+        ({"explore__noise": "chunk"}, "sft"),
         ({"world_model__steps": 3}, "explore"),
         ({"reflector__threshold": 0.6}, "world_model"),
         ({"adapt__steps": 3}, "reflector"),
@@ -112,6 +112,7 @@ def test_a_stage_reads_no_setting_that_could_change_unnoticed(whole):
         ({"post_train__probe_contexts": 3}, "adapted"),
         ({"post_train__hold": 0.0}, "reflector"),
         ({"post_train__draw": 1}, "adapted"),
+        ({"post_train__noise": "chunk"}, "adapted"),
         ({"post_train__env": "tabletop"}, "explore"),  # of what is held
         ({"evaluate__episodes_per_task": 3}, "post_train"),
         ({"rounds": 2}, "post_train"),

@@ -23,7 +23,7 @@ from worldenv_trl.metrics import group_correlations
 from worldenv_trl.record import read_rollouts
 from worldenv_trl.reflectors import Reflector, StopRule
 
-DRAW = Draw(contexts=4, group_size=2, scale_factor=1.0, seed=0)
+DRAW = Draw(contexts=4, group_size=2, scale_factor=1.0, noise="step", seed=0)
 
 
 @pytest.fixture

@@ -72,7 +72,8 @@ def test_contexts_come_in_shuffled_passes(physics):
 
 
 def test_with_the_noise_of_chunks_every_step_of_a_chunk_is_displaced_alike_and_has_its_ratio(physics):
-    run = dataclasses.replace(physics, config=dataclasses.replace(physics.config, noise="chunk"))
+    settings = dataclasses.replace(physics.config.post_train, noise="chunk")
+    run = dataclasses.replace(physics, config=dataclasses.replace(physics.config, post_train=settings))
     post_train(run, "sft", "post_train", "", returns_of=lambda wave: wave[keys.CHUNK][..., 0].mean((-1, -2)))
     first, last = (read_rollouts(run.folder.rollouts(f"post_train_{number:03d}")) for number in (0, 3))
     for wave in (first, last):

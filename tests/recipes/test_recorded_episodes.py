@@ -53,16 +53,19 @@ def test_either_side_has_a_state(share):
         assert len(states(training)) == len(states(kept_out)) == 1
 
 
-@pytest.fixture(scope="module")
-def explored(tmp_path_factory):
-    """An exploration whose second scale is greedy, and the demonstrations that are stored with it."""
-    run = small_untrained(
-        tmp_path_factory.mktemp("episodes"),
-        max_steps=40,
-        explore=config.Explore(episodes_per_task=4, num_envs=2, scale_factors=(1.0, 0.0)),
-    )
+def explored_with(folder, **options):
+    """A small exploration of two scales, and the demonstrations that are stored with it."""
+    sizes = {"episodes_per_task": 4, "num_envs": 2, "scale_factors": (1.0, 0.0)}
+    run = small_untrained(folder, max_steps=40, explore=config.Explore(**sizes | options))
     demonstrate(run)
     explore(run)
+    return run
+
+
+@pytest.fixture(scope="module")
+def explored(tmp_path_factory):
+    """An exploration whose second scale is greedy."""
+    run = explored_with(tmp_path_factory.mktemp("episodes"))
     yield run
     run.close()
 
@@ -83,3 +86,17 @@ def test_what_was_explored_without_noise_is_the_policys_means(explored):
     assert (noisy[keys.ACTION][:, 0] - mean).abs().mean() > 0.01
     succeeded = greedy[keys.SUCCESS].flatten(1).any(-1)
     assert torch.equal(succeeded, reached_goal(own))
+
+
+def test_the_noise_of_chunks_displaces_all_steps_of_an_explored_chunk_alike(explored, tmp_path):
+    spreads = []
+    for run in (explored_with(tmp_path, noise="chunk", scale_factors=(1.0,)), explored):
+        noisy = read_rollouts(run.folder.rollouts("explore"))[:2, : run.config.chunk_length]
+        with torch.no_grad():
+            dist = exploring_actor(run.config, run.policy("sft").eval(), 1.0).get_dist(noisy[:, 0])
+        away = noisy[keys.ACTION] - dist.loc
+        inside = (noisy[keys.ACTION].abs() < 1).all(1)  # what leaves the range of actions is clipped
+        assert inside.float().mean() > 0.5
+        spreads.append((away.amax(1) - away.amin(1))[inside])
+    run.close()
+    assert spreads[0].max() < 1e-4 and spreads[1].min() > 1e-2

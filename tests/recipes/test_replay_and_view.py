@@ -15,7 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import replay as replay_recipe
 import view as view_recipe
-from config import PRESETS
+from config import PRESETS, Explore, PostTrain
 from physics import exploring_actor
 from worldenv_trl import keys
 from worldenv_trl.collectors import GroupCollector
@@ -150,16 +150,25 @@ def test_foxglove_gets_a_layout_of_the_recording(run, tmp_path, capsys, monkeypa
     assert "Plot!action" in json.loads(target.read_text())["configById"]
 
 
-@pytest.mark.parametrize("noise", ["step", "chunk"])
-def test_a_sampled_what_if_has_the_noise_of_the_run_that_was_recorded(noise):
+@pytest.mark.parametrize(
+    ("stage", "settings", "noise"),
+    [
+        ("post_train", {"explore": Explore(noise="chunk")}, "step"),
+        ("post_train_2", {"post_train": PostTrain(noise="chunk")}, "chunk"),
+        ("explore", {"explore": Explore(noise="chunk")}, "chunk"),
+        ("explore_2", {"post_train": PostTrain(noise="chunk")}, "step"),
+    ],
+)
+def test_a_sampled_what_if_has_the_noise_of_the_stage_that_was_recorded(stage, settings, noise):
     policy = OFTPolicy(OFTConfig(("open the drawer",), image_size=32, dim=32))
     td = TensorDict(
         {"observation": {"image": torch.zeros(1, 3, 32, 32, dtype=torch.uint8), "state": torch.zeros(1, 7)}}
     )
     td = td.auto_batch_size_(1).set(keys.INSTRUCTION, "open the drawer")
-    config = dataclasses.replace(PRESETS["improve"][1], noise=noise)
-    exploring = exploring_actor(config, policy, config.post_train.scale_factor)
-    recorded = replay_recipe.recorded_actor(policy, json.loads(json.dumps(dataclasses.asdict(config), default=str)))
+    config = dataclasses.replace(PRESETS["improve"][1], **settings)
+    exploring = exploring_actor(config, policy, config.post_train.scale_factor, noise)
+    told = {"stage": stage, "config": json.loads(json.dumps(dataclasses.asdict(config), default=str))}
+    recorded = replay_recipe.recorded_actor(policy, told)
     own = replay_recipe.recorded_actor(policy, {})
     with set_exploration_type(ExplorationType.RANDOM):
         chunks = []
