@@ -1,4 +1,4 @@
-"""What is wrong with settings, before any long work starts."""
+"""What is wrong with settings, or seldom meant so, before any long work starts."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from loggers import check_loggers
 from parts import COMPACT, Parts
 from physics import tabletop
 from ranges import check_ranges
+from task_names import SUITES
 from worldenv_trl.data import ACTIONS
 from worldenv_trl.devices import choose_device
 from worldenv_trl.policies import Policy, TokenPolicy
@@ -170,3 +171,19 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
                     check_loop(config, made)
             except ValueError as error:
                 raise ValueError(f"the {name.replace('_', ' ')} cannot be made of these settings: {error}") from error
+
+
+def doubts(config: WorldEnvConfig) -> list[str]:
+    """What checked settings allow and is seldom meant, a line each."""
+    lines = []
+    if config.adapt.correct_steps and not config.adapt.steps:
+        lines.append(f"adapt.correct_steps={config.adapt.correct_steps} is not read: adapt.steps is 0")
+    of_suites = [task for task in map(load_task, config.tasks) if task.suite in SUITES]
+    longest = max(of_suites, key=lambda task: task.max_steps, default=None)
+    if longest is not None and longest.max_steps > config.max_steps:
+        enough = -(-longest.max_steps // config.chunk_length) * config.chunk_length
+        lines.append(
+            f"max_steps={config.max_steps} ends rollouts before the {longest.max_steps} steps of {longest.name}: "
+            f"--max-steps {enough}"
+        )
+    return lines

@@ -290,8 +290,8 @@ class WorldEnvConfig:
     parts: str = "compact"
     """``compact``, made here, or ``real-size``: pretrained ones of the folders in ``real_size``."""
     tasks: tuple[str, ...] = GOAL_TASKS
-    """``suite/name`` or a ``.bddl`` file, each once; ``task_id`` is the place in this list. LIBERO's ``_demo.hdf5``
-    files, or a folder of them, bring their demonstrations along."""
+    """``suite/name``, a ``suite`` for all of it, or a ``.bddl`` file, each once; ``task_id`` is the place in this list.
+    LIBERO's ``_demo.hdf5`` files, or a folder of them, bring their demonstrations along."""
     cameras: tuple[str, ...] = ("agentview",)
     """Cameras that every part sees through: ``agentview``, ``wrist`` and any other that the scenes have."""
     image_size: int = 64

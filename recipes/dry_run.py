@@ -14,17 +14,18 @@ from dataclasses import replace
 import torch
 
 from beginning import beginning
-from checks import check_config
+from checks import check_config, doubts
 from command_line import expected, in_options
 from config import WorldEnvConfig
 from gpus import GPUS
-from libero_files import told, with_files
+from libero_files import told
 from parts import COMPACT, Parts
 from real_parts import parts_of
 from rehearsal import Rehearsal, rehearse
 from run_folder import RunFolder
 from stage_plan import Machine, StagePlan, decisions, iteration_flops, moved_bytes, stage_plans, wave_bytes
 from stages import plan
+from task_names import with_tasks
 
 _HERE = "here"
 _TITLES = {"policy": "policy", "world_model": "world model", "reflector": "reflector"}
@@ -59,7 +60,7 @@ def split(arguments: Sequence[str]) -> tuple[argparse.Namespace | None, list[str
 def dry_run(config: WorldEnvConfig, chosen: argparse.Namespace, parts: Parts | None = None) -> int:
     """Prints the plan and, a line each, what does not fit; returns how many lines these are."""
     try:
-        config = with_files(config)
+        config = with_tasks(config)
         parts = parts_of(config) if parts is None else parts
         machine = _machine(config, chosen)
         # Whether this machine has the run's device says nothing of another one; the parts are built below.
@@ -80,6 +81,8 @@ def dry_run(config: WorldEnvConfig, chosen: argparse.Namespace, parts: Parts | N
     here = [f"{', '.join(finished)}: finished in {folder.path}"] if finished else []
     for line in (*told(config), *found.shapes, *([str(begun)] if begun else here)):
         print(line)
+    for doubt in doubts(config):
+        print(f"warning: {doubt}")
     if found.problems:
         return _refused(found.problems)
     _show_parts(found)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
-from pathlib import Path
 
 from tqdm import tqdm
 
@@ -15,28 +13,6 @@ from run import Run
 from worldenv_trl.data import LiberoFile, episodes_from_rollouts, inspect_libero, predicted_poses, read_libero
 from worldenv_trl.hdf5_file import SUFFIXES
 from worldenv_trl.record import RolloutWriter
-
-
-def with_files(config: WorldEnvConfig) -> WorldEnvConfig:
-    """The settings with the files of each folder in ``tasks`` in the folder's place, by name.
-
-    Raises:
-        ValueError: for a folder without such files.
-    """
-    tasks: list[str] = []
-    for task in config.tasks:
-        folder = Path(task)
-        if not folder.is_dir():
-            tasks.append(task)
-            continue
-        files = sorted(str(path) for suffix in SUFFIXES for path in folder.glob(f"*{suffix}"))
-        if not files:
-            raise ValueError(
-                f"tasks names the folder {folder}, which holds no file of LIBERO's (*_demo.hdf5): a suite's folder of "
-                "its download does"
-            )
-        tasks += files
-    return config if tuple(tasks) == config.tasks else replace(config, tasks=tuple(tasks))
 
 
 def from_libero(config: WorldEnvConfig) -> bool:

@@ -17,14 +17,15 @@ from tqdm import tqdm
 
 import processes
 from beginning import beginning
-from checks import check_config, check_shares
+from checks import check_config, check_shares, doubts
 from command_line import INTERRUPTED, expected, in_options, refusals
 from config import PRESETS, WorldEnvConfig
-from libero_files import from_libero, with_files
+from libero_files import from_libero
 from parts import Parts
 from real_parts import parts_of
 from run import Run
 from run_folder import RunFolder
+from task_names import with_tasks
 from threads import use_threads
 from worldenv_trl.pretrained import saved_class
 from worldenv_trl.scenes import load_task
@@ -148,7 +149,7 @@ def open_run(config: WorldEnvConfig, parts: Parts | None = None) -> Run:
     """The run of checked settings, with the parts that they name unless others are given; what is wrong is said in one
     line."""
     with refusals():
-        config = with_files(config)
+        config = with_tasks(config)
         processes.join(config.device)
         chosen = parts_of(config) if parts is None else parts
         folder = RunFolder(config.run_dir)
@@ -162,8 +163,8 @@ def open_run(config: WorldEnvConfig, parts: Parts | None = None) -> Run:
 
 def _check_and_open(config: WorldEnvConfig, parts: Parts, folder: RunFolder, count: int) -> None:
     check_config(config, parts)
-    if config.adapt.correct_steps and not config.adapt.steps:
-        _warn(f"adapt.correct_steps={config.adapt.correct_steps} is not read: adapt.steps is 0")
+    for doubt in doubts(config):
+        _warn(doubt)
     check_shares(config, count)
     check_made_of(plan(config), parts, folder)
     begun = beginning(config, plan(config), folder)

@@ -16,7 +16,6 @@ from demonstrate import demonstrate
 from episodes import explored_at
 from explore import explore
 from sft import lowest_heights
-from stages import open_run
 from worldenv_trl import keys
 from worldenv_trl.data import corrected_samples, until_reached
 from worldenv_trl.language import instructions_of
@@ -171,8 +170,3 @@ def test_without_greedy_exploration_it_is_refused_before_any_work_but_not_where_
     with pytest.raises(ValueError, match=r"keeps what greedy rollouts do: explore.scale_factors must hold 0, got 1"):
         check_config(dataclasses.replace(SMALL, adapt=config.Adapt(steps=1, correct_steps=5)))
     check_config(dataclasses.replace(SMALL, adapt=config.Adapt(steps=0, correct_steps=5)))
-
-
-def test_steps_that_nothing_reads_are_said_to_be_unread(tmp_path, capsys):
-    open_run(dataclasses.replace(SMALL, run_dir=tmp_path / "run", adapt=config.Adapt(correct_steps=5))).close()
-    assert "warning: adapt.correct_steps=5 is not read: adapt.steps is 0" in capsys.readouterr().err

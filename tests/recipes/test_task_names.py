@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from command_line import at_least, refusals
-from task_names import named_tasks
+from config import WorldEnvConfig
+from task_names import named_tasks, with_tasks
 from worldenv_trl.scenes import list_tasks
 
 
@@ -28,6 +29,19 @@ def test_suites_tasks_and_files_are_taken_once_and_in_order():
 def test_a_word_that_is_none_of_them_is_answered_with_what_is_close(words, message):
     with pytest.raises(ValueError, match=message):
         named_tasks(words)
+
+
+def test_a_run_of_a_suite_has_its_tasks(tmp_path, monkeypatch):
+    words = ("goal/turn_on_the_stove", "starter", "a_demo.hdf5", "mine.bddl")
+    found = with_tasks(WorldEnvConfig(tasks=words)).tasks
+    assert found == ("goal/turn_on_the_stove", *list_tasks("starter"), "a_demo.hdf5", "mine.bddl")
+    (tmp_path / "starter").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert with_tasks(WorldEnvConfig(tasks=("starter",))).tasks == tuple(list_tasks("starter"))
+    with pytest.raises(ValueError, match="the folder starter, which holds no file of LIBERO's"):
+        with_tasks(WorldEnvConfig(tasks=("./starter",)))
+    with pytest.raises(ValueError, match="did you mean 'goal'"):
+        with_tasks(WorldEnvConfig(tasks=("gaol",)))
 
 
 def test_numbers_that_are_too_small_are_named_like_their_options():
