@@ -124,14 +124,15 @@ def imagined_outcomes(
 
 def greedy_outcomes(
     run: Run, actor: TensorDictModuleBase, imagination: Imagination, per_task: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Greedy success on up to ``per_task`` training contexts of every task: ``(real, imagined)``, bool ``[K]``.
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Greedy success on up to ``per_task`` training contexts of every task: ``(real, imagined, task_id)``, bool ``[K]``
+    twice and int64 ``[K]``.
 
     They are spread over all contexts: the first ones are the demonstrations' own.
     """
     config, contexts = run.config, imagination.contexts
     numbers = contexts[keys.CONTEXT_ID].squeeze(-1)
-    chosen, real = [], []
+    chosen, real, tasks = [], [], []
     for place, task in enumerate(config.tasks):
         first = context_id(place, "train", 0)
         rows = ((numbers >= first) & (numbers < first + config.train_states)).nonzero().squeeze(-1)
@@ -141,4 +142,5 @@ def greedy_outcomes(
             outcome = physics_outcomes(run, actor, task, "train", len(indices), indices=indices)
             chosen.append(rows)
             real.append(outcome)
-    return torch.cat(real), imagined_outcomes(run, actor, imagination, contexts[torch.cat(chosen)])
+            tasks.append(torch.full([len(rows)], place))
+    return torch.cat(real), imagined_outcomes(run, actor, imagination, contexts[torch.cat(chosen)]), torch.cat(tasks)

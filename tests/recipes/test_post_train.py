@@ -36,7 +36,8 @@ def test_the_first_and_the_last_iteration_are_probed():
 
 def test_imagined_success_that_rises_alone_is_logged_and_warned_about(monkeypatch, tmp_path):
     imagined = iter([torch.arange(48) < count for count in (20, 22, 40, 44)])
-    monkeypatch.setattr(probes, "greedy_outcomes", lambda *_: (torch.arange(48) % 2 == 0, next(imagined)))
+    tasks = torch.arange(3).repeat_interleave(16)
+    monkeypatch.setattr(probes, "greedy_outcomes", lambda *_: (torch.arange(48) % 2 == 0, next(imagined), tasks))
     run, alarm = Run(PRESETS["improve"][1], RunFolder(tmp_path)), HonestyAlarm(4, window=1)
     logged = [probes.probe(run, None, "imagination", alarm) for _ in range(4)]
     assert [line["honesty_alarm"] for line in logged] == [0, 0, 1, 1]
@@ -44,13 +45,18 @@ def test_imagined_success_that_rises_alone_is_logged_and_warned_about(monkeypatc
     text = probes.warning("post_train", "adapted", 12, logged[-1])
     assert "iteration 12: imagined success has risen by 50.0 points" in text
     assert "real success by +0.0 (now 92 % and 50 % of 48 training contexts" in text
+    drawer, stove = PRESETS["improve"][1].tasks[1:]
+    assert logged[0][f"imagined_success_{drawer}"] == 4 / 16 and logged[-1][f"imagined_success_{stove}"] == 12 / 16
+    assert logged[-1][f"real_success_{stove}"] == 0.5
+    assert "; furthest apart on starter/put_the_bowl_on_the_plate, 100 % and 50 %)" in text
     assert text.endswith("training goes on; where this is still said at its end keep checkpoints/adapted")
 
 
 def test_without_a_world_model_there_is_nothing_to_distrust(monkeypatch, tmp_path):
     monkeypatch.setattr(probes, "physics_outcomes", lambda *_, **__: torch.tensor([True, False]))
     logged = probes.probe(Run(PRESETS["smoke"][1], RunFolder(tmp_path)), None, None, None)
-    assert logged == {"real_success": 0.5, "probe_episodes": 6}
+    each = {f"real_success_{task}": 0.5 for task in PRESETS["smoke"][1].tasks}
+    assert logged == {"real_success": 0.5, "probe_episodes": 6} | each
 
 
 @pytest.fixture

@@ -65,6 +65,8 @@ def run_folder(path: Path, *, evaluated: bool = True, alarm: bool = False) -> Pa
     for k in range(6):
         probe = {"imagined_success": 0.5 + 0.05 * k, "real_success": 0.6 + 0.02 * k, "honesty_alarm": 0.0}
         probe |= {"imagined_rise": 0.05 * k, "real_rise": 0.02 * k}
+        for world in ("imagined_success", "real_success"):
+            probe[f"{world}_starter/turn_on_the_stove"] = probe[world] - 0.25
         if alarm and k == 4:
             probe |= {"honesty_alarm": 1.0, "imagined_rise": 0.3, "real_rise": -0.1, "honesty_p": 0.0004}
         lines.append({"stage": "post_train", "step": k, "return": 0.5 + 0.04 * k} | probe)

@@ -58,6 +58,16 @@ def test_an_alarm_is_seen_at_the_top(tmp_path):
     assert "silent one probe, and nothing" in text_of(render_report(RunRecord.read(tmp_path / "other")))
 
 
+def test_probes_are_shown_task_by_task_where_they_were_noted(tmp_path):
+    record = RunRecord.read(run_folder(tmp_path / "run"))
+    text = text_of(render_report(record))
+    assert "The probes of post_train, task by task" in text
+    assert "turn on the stove 25.0 35.0 50.0 45.0 +5.0" in text
+    for line in record.lines:
+        line.pop("real_success_starter/turn_on_the_stove", None)
+    assert "task by task" not in text_of(render_report(record))
+
+
 def test_shares_of_nothing_are_not_shown_as_none(tmp_path):
     never = torch.zeros(4, dtype=torch.bool)
     row = honesty(never, never, imagined_steps=never, real_steps=never)

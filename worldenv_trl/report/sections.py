@@ -156,6 +156,7 @@ def honesty(record: RunRecord, evidence: Evidence | None) -> str:
                     f"<strong>{len(pairs)} policies</strong> probed in {escape(stage)}: <strong>{rho:.2f}</strong> "
                     "(1: imagination orders them as the physics does).</p>"
                 )
+        parts += _probed_tasks(record, stage)
     if not (evidence and evidence.honesty):
         parts.insert(0, missing(_absent(evidence, "no imagined-versus-real table of the policies")))
     say = (
@@ -253,6 +254,21 @@ def interval_of_points(test: dict[str, Any]) -> str:
 
 def _rated(line: dict[str, Any]) -> str:
     return interval(line["success"], line["low"], line["high"])
+
+
+def _probed_tasks(record: RunRecord, stage: str) -> list[str]:
+    """The first and the last probe of LOOP, task by task; nothing of a run that did not note them."""
+    cells, worlds = [], ("imagined_success", "real_success")
+    for task in record.config.get("tasks", []):
+        found = [record.series(stage, f"{world}_{task}")[1] for world in worlds]
+        if all(found):
+            gap = found[0][-1] - found[1][-1]
+            cells.append((escape(task_name(task)), *(rate(each[at]) for at in (0, -1) for each in found), points(gap)))
+    if not cells:
+        return []
+    figures = [f"{world}, {when}, %" for when in ("first", "last") for world in ("imagined", "real")]
+    shown = table(("task", *figures, "last gap, points"), cells, label=f"probes of {stage}")
+    return [f"<h3>The probes of {escape(stage)}, task by task</h3>", shown]
 
 
 def _honesty_table(first: str, rows: Sequence[dict[str, Any]]) -> str:
