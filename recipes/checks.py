@@ -10,9 +10,9 @@ from loggers import check_loggers
 from parts import COMPACT, Parts
 from physics import tabletop
 from ranges import check_ranges
-from task_names import SUITES
 from worldenv_trl.data import ACTIONS
 from worldenv_trl.devices import choose_device
+from worldenv_trl.hdf5_file import SUFFIXES
 from worldenv_trl.policies import Policy, TokenPolicy
 from worldenv_trl.policies.actor import NOISES
 from worldenv_trl.reflectors import StopRule
@@ -178,7 +178,7 @@ def doubts(config: WorldEnvConfig) -> list[str]:
     lines = []
     if config.adapt.correct_steps and not config.adapt.steps:
         lines.append(f"adapt.correct_steps={config.adapt.correct_steps} is not read: adapt.steps is 0")
-    of_suites = [task for task in map(load_task, config.tasks) if task.suite in SUITES]
+    of_suites = [load_task(name) for name in config.tasks if not name.endswith((".bddl", *SUFFIXES))]
     longest = max(of_suites, key=lambda task: task.max_steps, default=None)
     if longest is not None and longest.max_steps > config.max_steps:
         enough = -(-longest.max_steps // config.chunk_length) * config.chunk_length

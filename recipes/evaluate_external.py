@@ -92,7 +92,8 @@ def compare(run: Run, policy: ExternalPolicy, settings: Settings) -> None:
             )
         if imagination is not None:
             actor = policy_actor(own.policy(name))
-            real, imagined, _ = greedy_outcomes(own, actor, imagination, settings.imagined)
+            found = greedy_outcomes(own, actor, imagination, settings.imagined)
+            real, imagined = (torch.cat([*each.values()]) for each in found)
             folder.log(name, real_success=real.float().mean().item(), imagined_success=imagined.float().mean().item())
             _say(f"{name}, training contexts, physics", real)
             _say(f"{name}, training contexts, imagined", imagined)

@@ -124,23 +124,22 @@ def imagined_outcomes(
 
 def greedy_outcomes(
     run: Run, actor: TensorDictModuleBase, imagination: Imagination, per_task: int
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Greedy success on up to ``per_task`` training contexts of every task: ``(real, imagined, task_id)``, bool ``[K]``
-    twice and int64 ``[K]``.
+) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    """Greedy success on up to ``per_task`` training contexts of every task: ``(real, imagined)``, each task -> bool
+    ``[K]``; a task of which there is no context is left out.
 
     They are spread over all contexts: the first ones are the demonstrations' own.
     """
     config, contexts = run.config, imagination.contexts
     numbers = contexts[keys.CONTEXT_ID].squeeze(-1)
-    chosen, real, tasks = [], [], []
+    chosen, real = [], {}
     for place, task in enumerate(config.tasks):
         first = context_id(place, "train", 0)
         rows = ((numbers >= first) & (numbers < first + config.train_states)).nonzero().squeeze(-1)
         if len(rows):
             rows = rows[torch.linspace(0, len(rows) - 1, min(per_task, len(rows))).long()]
             indices = (numbers[rows] - first).tolist()
-            outcome = physics_outcomes(run, actor, task, "train", len(indices), indices=indices)
+            real[task] = physics_outcomes(run, actor, task, "train", len(indices), indices=indices)
             chosen.append(rows)
-            real.append(outcome)
-            tasks.append(torch.full([len(rows)], place))
-    return torch.cat(real), imagined_outcomes(run, actor, imagination, contexts[torch.cat(chosen)]), torch.cat(tasks)
+    imagined = imagined_outcomes(run, actor, imagination, contexts[torch.cat(chosen)])
+    return real, dict(zip(real, imagined.split([len(rows) for rows in chosen]), strict=True))

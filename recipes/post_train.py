@@ -155,7 +155,7 @@ def post_train(
             metrics |= processes.on_main(lambda: probe(run, mean_actor, imagination, alarm))
             metrics["probe_seconds"], started = time.monotonic() - started, time.monotonic()
             if metrics.get("honesty_alarm") and processes.is_main():
-                progress.write(warning(target, source, iteration, metrics))
+                progress.write(warning(target, source, iteration, metrics, config.tasks))
         run.folder.log(target, step=iteration, **metrics)
         progress.set_postfix({k: f"{metrics[k]:.3f}" for k in ("return", "kl_approx", "real_success") if k in metrics})
         del wave, mine  # before the next ones are collected

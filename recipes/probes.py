@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -29,13 +29,15 @@ def probe(
     count = config.post_train.probe_contexts
     if imagination is None or alarm is None:  # one comes with the other
         indices = torch.linspace(0, config.train_states - 1, min(count, config.train_states)).long().tolist()
-        tasks = [physics_outcomes(run, actor, task, "train", len(indices), indices=indices) for task in config.tasks]
-        real, numbers = torch.cat(tasks), torch.cat([torch.full([len(each)], n) for n, each in enumerate(tasks)])
-        found = {"real_success": real.float().mean().item(), "probe_episodes": len(real)}
-        return found | by_task("real_success", real, numbers, config.tasks)
-    real, imagined, numbers = greedy_outcomes(run, actor, imagination, count)
-    report = honesty(imagined, real)
-    watch = alarm.update(imagined, real)
+        real = {
+            task: physics_outcomes(run, actor, task, "train", len(indices), indices=indices) for task in config.tasks
+        }
+        outcomes = torch.cat([*real.values()])
+        found = {"real_success": outcomes.float().mean().item(), "probe_episodes": len(outcomes)}
+        return found | by_task("real_success", real)
+    real, imagined = greedy_outcomes(run, actor, imagination, count)
+    both = [torch.cat([*each.values()]) for each in (imagined, real)]
+    report, watch = honesty(*both), alarm.update(*both)
     return {
         "real_success": report["real"],
         "imagined_success": report["imagined"],
@@ -46,29 +48,25 @@ def probe(
         "honesty_p": watch.p_value,
         "imagined_rise": watch.imagined_rise,
         "real_rise": watch.real_rise,
-        **by_task("real_success", real, numbers, config.tasks),
-        **by_task("imagined_success", imagined, numbers, config.tasks),
+        **by_task("real_success", real),
+        **by_task("imagined_success", imagined),
     }
 
 
-def by_task(name: str, outcomes: torch.Tensor, numbers: torch.Tensor, tasks: Sequence[str]) -> dict[str, float]:
-    """``<name>_<task>``, the mean of the outcomes [K] of each task that is among their task ids [K]."""
-    return {
-        f"{name}_{tasks[task]}": outcomes[numbers == task].float().mean().item() for task in numbers.unique().tolist()
-    }
+def by_task(name: str, outcomes: Mapping[str, torch.Tensor]) -> dict[str, float]:
+    """``<name>_<task>``, the mean of each task's outcomes [K]."""
+    return {f"{name}_{task}": each.float().mean().item() for task, each in outcomes.items()}
 
 
-def warning(target: str, source: str, iteration: int, metrics: dict[str, float]) -> str:
-    worlds = ("imagined_success", "real_success")
-    tasks = [name.removeprefix("real_success_") for name in metrics if name.startswith("real_success_")]
-    apart = {task: [metrics[f"{world}_{task}"] for world in worlds] for task in tasks}
-    worst = max(tasks, key=lambda task: apart[task][0] - apart[task][1])
+def warning(target: str, source: str, iteration: int, metrics: dict[str, float], tasks: Sequence[str]) -> str:
+    worlds = [{task: metrics.get(f"{name}_success_{task}", 0.0) for task in tasks} for name in ("imagined", "real")]
+    worst = max(tasks, key=lambda task: worlds[0][task] - worlds[1][task])
     return (
         f"warning: {target}, iteration {iteration}: imagined success has risen by {100 * metrics['imagined_rise']:.1f} "
         f"points since the first probes, real success by {100 * metrics['real_rise']:+.1f} (now "
         f"{100 * metrics['imagined_success']:.0f} % and {100 * metrics['real_success']:.0f} % of "
         f"{metrics['probe_episodes']} training contexts, p = {metrics['honesty_p']:.2g}; furthest apart on {worst}, "
-        f"{100 * apart[worst][0]:.0f} % and {100 * apart[worst][1]:.0f} %): "
+        f"{100 * worlds[0][worst]:.0f} % and {100 * worlds[1][worst]:.0f} %): "
         "the policy may be learning the world model's errors; training goes on; where this is "
         f"still said at its end keep checkpoints/{source}"
     )

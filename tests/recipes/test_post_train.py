@@ -36,16 +36,20 @@ def test_the_first_and_the_last_iteration_are_probed():
 
 def test_imagined_success_that_rises_alone_is_logged_and_warned_about(monkeypatch, tmp_path):
     imagined = iter([torch.arange(48) < count for count in (20, 22, 40, 44)])
-    tasks = torch.arange(3).repeat_interleave(16)
-    monkeypatch.setattr(probes, "greedy_outcomes", lambda *_: (torch.arange(48) % 2 == 0, next(imagined), tasks))
+    tasks = PRESETS["improve"][1].tasks
+
+    def each(outcomes):
+        return dict(zip(tasks, outcomes.split(16), strict=True))
+
+    monkeypatch.setattr(probes, "greedy_outcomes", lambda *_: (each(torch.arange(48) % 2 == 0), each(next(imagined))))
     run, alarm = Run(PRESETS["improve"][1], RunFolder(tmp_path)), HonestyAlarm(4, window=1)
     logged = [probes.probe(run, None, "imagination", alarm) for _ in range(4)]
     assert [line["honesty_alarm"] for line in logged] == [0, 0, 1, 1]
     assert logged[-1]["imagined_rise"] == pytest.approx(24 / 48) and logged[-1]["probe_episodes"] == 48
-    text = probes.warning("post_train", "adapted", 12, logged[-1])
+    text = probes.warning("post_train", "adapted", 12, logged[-1], tasks)
     assert "iteration 12: imagined success has risen by 50.0 points" in text
     assert "real success by +0.0 (now 92 % and 50 % of 48 training contexts" in text
-    drawer, stove = PRESETS["improve"][1].tasks[1:]
+    drawer, stove = tasks[1:]
     assert logged[0][f"imagined_success_{drawer}"] == 4 / 16 and logged[-1][f"imagined_success_{stove}"] == 12 / 16
     assert logged[-1][f"real_success_{stove}"] == 0.5
     assert "; furthest apart on starter/put_the_bowl_on_the_plate, 100 % and 50 %)" in text
