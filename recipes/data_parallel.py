@@ -89,17 +89,24 @@ class DataParallel:
         Args:
             value: scalar, the mean over this process's rows.
             weight: what they weigh in it.
+
+        Raises:
+            ValueError: for a mean that is not finite, before anything is learned from it.
         """
         if self._size == 1:
+            _check_finite(value)
             value.backward()
             return value.detach()
         weight = torch.as_tensor(weight, dtype=value.dtype, device=value.device)
         weighted, weights = processes.total(torch.stack([value.detach() * weight, weight])).unbind()
+        mean = weighted / weights.clamp_min(1e-12)
+        _check_finite(mean)
         self._backward(value * (weight / weights.clamp_min(1e-12)))
-        return weighted / weights.clamp_min(1e-12)
+        return mean
 
     def backward_sum(self, value: Tensor) -> None:
-        """Gradients of the sum of what all processes give."""
+        """Gradients of the sum of what all processes give; raises as :meth:`backward_mean`, of what this one gives."""
+        _check_finite(value)
         if self._size == 1:
             value.backward()
         else:
@@ -181,6 +188,15 @@ class WholeOptimizer:
             for index, each in state_dict["state"].items()
         }
         self.optimizer.load_state_dict(state_dict | {"state": moments})
+
+
+def _check_finite(loss: Tensor) -> None:
+    # A backward pass through infinities can end the process without a word.
+    if not bool(loss.isfinite()):
+        raise ValueError(
+            f"the loss is {loss.item()}: lower the stage's learning rate, or look for NaN in the part and its data; "
+            "another --run-dir with --begin-from this one takes over the stages before"
+        )
 
 
 def _nothing(batch: TensorDictBase) -> TensorDictBase:
