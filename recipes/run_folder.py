@@ -256,11 +256,14 @@ class RunFolder:
     def stage(self, name: str) -> Iterator[None]:
         """Runs a stage and marks it finished at the end.
 
-        What an earlier attempt has logged goes; a finished one's checkpoints, too, so that it begins anew. Its loops
-        bring back what belongs to the checkpoint from which they continue.
+        What an earlier attempt has logged goes; a finished one's checkpoints, too, so that it begins anew, and if it
+        ends before it has any, what was finished still is. Its loops bring back what belongs to the checkpoint from
+        which they continue.
         """
+        before: Callable[[], None] | None = None
         if processes.is_main():
             if self.done(name):
+                before = self._as_it_was(name)
                 self.forget(name)
             shutil.rmtree(self.path / "scratch", ignore_errors=True)
         processes.barrier()
@@ -280,8 +283,25 @@ class RunFolder:
             self.loggers.recordings(path for path in files if path.stat().st_mtime >= since)
             shutil.rmtree(self.progress(name), ignore_errors=True)
             shutil.rmtree(self.path / "scratch", ignore_errors=True)
+        except BaseException:
+            if before is not None and not any(path.is_file() for path in self.progress(name).rglob("*")):
+                before()
+            raise
         finally:
             self.running, self._started, self._seconds = outer
+
+    def _as_it_was(self, name: str) -> Callable[[], None]:
+        """What makes a stage as finished as it is now, once it was forgotten and nothing else has changed."""
+        mark, begun, lines = self.path / "stages" / name, self.noted("begun"), self.read_metrics(name)
+        text = mark.read_text()
+
+        def restore() -> None:
+            self.restore_stage(name, 0.0, lines)
+            if begun:
+                self.note("begun", begun)
+            _write_atomically(mark, text)
+
+        return restore
 
     def stage_seconds(self) -> float:
         """That the running stage has taken, in this process and in those that it continues."""

@@ -26,7 +26,7 @@ from real_parts import parts_of
 from run import Run
 from run_folder import RunFolder
 from task_names import with_tasks
-from threads import use_threads
+from threads import check_threads, use_threads
 from worldenv_trl.pretrained import saved_class
 from worldenv_trl.scenes import load_task
 
@@ -105,19 +105,22 @@ def plan(config: WorldEnvConfig) -> list[Stage]:
 
 
 def run_stages(run: Run, works: Mapping[str, Work]) -> None:
-    """Runs what is not finished yet; ``works`` says what a kind of stage does."""
-    for stage in plan(run.config):
+    """Runs what is not finished yet, and what learned from it before; ``works`` says what a kind of stage does."""
+    stages = plan(run.config)
+    for index, stage in enumerate(stages):
         if _finished(stage, run.folder):
             print(f"{stage.name}: finished, skipped")
-        else:
-            _run(stage, works[stage.kind], run)
+            continue
+        if run.folder.done(stage.name):
+            _warn(f"{stage.name} was finished, and {run.folder.path / stage.makes} is gone: it runs again")
+        _run(stage, works[stage.kind], run, stages[index + 1 :])
 
 
 def run_alone(kind: str, work: Work, arguments: Sequence[str] | None = None, parts: Parts | None = None) -> None:
     """Runs one stage of a preset alone, from the beginning if it is finished, else from where it was interrupted; of
     several rounds, the first unfinished one.
 
-    The stages after it, which learned from what it made before, count as not finished from then on.
+    The stages after it, which learned from what it made before, count as not finished once it is.
     """
     config = parse(sys.argv[1:] if arguments is None else arguments, work.__module__)
     run = open_run(config, parts)
@@ -132,12 +135,7 @@ def rerun(kind: str, work: Work, run: Run) -> None:
     if not same:
         raise SystemExit(f"these settings have no stage {kind!r}: {', '.join(stage.name for stage in stages)}")
     index = next((index for index in same if not _finished(stages[index], run.folder)), same[-1])
-    again = [later.name for later in stages[index + 1 :] if run.folder.done(later.name)]
-    for later in stages[index + 1 :]:
-        run.folder.forget(later.name)
-    if again:
-        print(f"{', '.join(again)} learned from what {stages[index].name} made before: to be run again")
-    _run(stages[index], work, run)
+    _run(stages[index], work, run, stages[index + 1 :])
 
 
 def parse(arguments: Sequence[str], module: str = "__main__") -> WorldEnvConfig:
@@ -162,6 +160,7 @@ def open_run(config: WorldEnvConfig, parts: Parts | None = None) -> Run:
 
 
 def _check_and_open(config: WorldEnvConfig, parts: Parts, folder: RunFolder, count: int) -> None:
+    check_threads(config.num_threads)
     check_config(config, parts)
     for doubt in doubts(config):
         _warn(doubt)
@@ -187,6 +186,14 @@ def check_made_of(stages: Sequence[Stage], parts: Parts, folder: RunFolder) -> N
             )
 
 
+def _forget(later: Sequence[Stage], stage: Stage, run: Run) -> None:
+    again = [each.name for each in later if run.folder.done(each.name)]
+    for each in later:
+        run.folder.forget(each.name)
+    if again and processes.is_main():
+        print(f"{', '.join(again)} learned from what {stage.name} made before: to be run again")
+
+
 def _finished(stage: Stage, folder: RunFolder) -> bool:
     return processes.agreed(stage.finished_in(folder))
 
@@ -196,8 +203,9 @@ def _warn(message: Warning | str) -> None:
         tqdm.write(f"warning: {message}", file=sys.stderr)
 
 
-def _run(stage: Stage, work: Work, run: Run) -> None:
-    """Runs a stage; Ctrl-C ends the program with one line, wherever it strikes, and so does an expected error."""
+def _run(stage: Stage, work: Work, run: Run, later: Sequence[Stage]) -> None:
+    """Runs a stage, and lets ``later`` ones be run again; Ctrl-C ends the program with one line, wherever it strikes,
+    and so does an expected error."""
     interrupted = threading.Event()
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -213,6 +221,7 @@ def _run(stage: Stage, work: Work, run: Run) -> None:
                 work(run, **stage.options)
             else:
                 processes.on_main(lambda: work(run, **stage.options))
+            _forget(later, stage, run)
     except BaseException as error:
         if not interrupted.is_set():
             if isinstance(error, processes.FailedElsewhere):
