@@ -62,6 +62,20 @@ class Parts:
     kinematics: Callable[[], ForwardKinematics] = ForwardKinematics
 
 
+def check_fits(config: WorldEnvConfig, part: nn.Module) -> None:
+    """Raises ``ValueError`` for a part that was made for other cameras, images or chunks than the run has."""
+    cameras = [camera for camera in getattr(part, "cameras", ()) if camera not in config.cameras]
+    if cameras:
+        raise ValueError(
+            f"{type(part).__name__} looks through {', '.join(cameras)}, and cameras are {', '.join(config.cameras)}: "
+            "make it for some of these, or add it to cameras"
+        )
+    for name in ("image_size", "chunk_length"):
+        made, wanted = getattr(part, name, None), getattr(config, name)
+        if made not in (None, wanted):
+            raise ValueError(f"{type(part).__name__} is made for {name}={made}, the run has {name}={wanted}")
+
+
 def instructions(config: WorldEnvConfig) -> tuple[str, ...]:
     """What the tasks ask for, in their order."""
     return tuple(load_task(task).language for task in config.tasks)

@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 import processes
 from collecting import spread_of, start_workers
 from config import WorldEnvConfig
-from parts import COMPACT, Parts
+from parts import COMPACT, Parts, check_fits
 from run_folder import RunFolder
 from seeds import stage_seed
 from worldenv_trl.collectors import GroupCollector, SpreadCollector, Workers
@@ -89,6 +89,16 @@ class Run:
     def seed_everything(self, stage: str, use: str = "") -> None:
         """Each stage has its own stream, so a stage run alone draws the same numbers as in the whole loop."""
         torch.manual_seed(self.seed(stage, use))
+
+    def new(self, name: str) -> Any:
+        """The ``policy``, ``world_model`` or ``reflector`` of the run's parts, untrained.
+
+        Raises:
+            ValueError: for one that is made for other cameras, images or chunks than the run has.
+        """
+        part = getattr(self.parts, name).make(self.config)
+        check_fits(self.config, part)
+        return part.to(self.device)
 
     def policy(self, name: str) -> Policy:
         stage = {"sft": "sft", "adapted": "adapt"}.get(name.split("_")[0], "post_train")

@@ -51,7 +51,7 @@ def fine_tune(run: Run) -> None:
     config = run.config
     run.seed_everything("sft")
     samples = policy_samples(demonstrations(run), config.chunk_length)
-    policy = run.parts.policy.make(config).to(run.device)
+    policy: Policy = run.new("policy")
     check_loop(config, policy)
     policy.fit_statistics(samples[keys.STATE], samples[keys.CHUNK])
     if isinstance(policy, TokenPolicy):

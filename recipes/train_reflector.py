@@ -41,7 +41,7 @@ def train_reflector(run: Run, target: str = "reflector", models: str = "", round
         def imagine(episodes: Episodes, name: str) -> Episodes:
             return imagined(run, world_model, episodes, target, name, scratch)
 
-        reflector = run.parts.reflector.make(config).to(run.device)
+        reflector: Reflector = run.new("reflector")
         episodes, shown = [demonstrated, training], {"real": held_out, "imagined": held_out}
         if reflector.for_world("imagined").reads_video:
             if len(chosen):

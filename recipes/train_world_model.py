@@ -25,13 +25,13 @@ from worldenv_trl.world_models import WorldModel
 
 def train_world_model(run: Run, target: str = "world_model", previous: str | None = None, rounds: int = 1) -> None:
     """Reads the rollouts of the first ``rounds`` rounds; writes ``checkpoints/<target>`` and its held-out fidelity."""
-    config, settings = run.config, run.config.world_model
+    settings = run.config.world_model
     run.seed_everything(target)
     demonstrated, explored = demonstrations_and_exploration(run, rounds)
     training, held_out = split_by_context(explored, settings.holdout, run.seed("held-out contexts"))
     training = Episodes.cat([demonstrated, training])
     if previous is None:
-        model, steps = run.parts.world_model.make(config).to(run.device), settings.steps
+        model, steps = run.new("world_model"), settings.steps
     else:
         model, steps = run.world_model(previous.removeprefix("world_model")), settings.refit_steps
     parameters = [parameter for parameter in model.train().parameters() if parameter.requires_grad]

@@ -51,3 +51,10 @@ def test_only_the_reflectors_cameras_are_looked_at():
 
 def test_scores_need_no_gradient():
     assert not score_episodes(Reddest(cameras=CAMERAS), make_episodes([2])).requires_grad
+
+
+def test_what_is_no_probability_is_refused():
+    episodes = make_episodes([3])
+    episodes.video[0]["frames", "image"][2] = 255
+    with pytest.raises(ValueError, match=r"Reddest.extend: scores must be probabilities, in \[0, 1\], got 1\.0"):
+        score_episodes(Reddest(cameras=CAMERAS), episodes)

@@ -121,6 +121,8 @@ class Careless(CountingWorldModel):
 )
 def test_a_world_model_that_does_not_paint_what_it_should_is_named(spoil, got):
     env = make_env(world_model=Careless(spoil))
-    expected = f"the world model must write ('frames', 'wrist_image') as uint8 (6, {C}, 3, {SIZE}, {SIZE}), got {got}"
+    expected = (
+        f"the world model Careless must write ('frames', 'wrist_image') as uint8 (6, {C}, 3, {SIZE}, {SIZE}), got {got}"
+    )
     with pytest.raises(ValueError, match=re.escape(expected)):
         env.step(with_chunk(env.reset()))

@@ -216,6 +216,22 @@ def test_scores_of_another_shape_are_refused(spoil):
         roll(reflected([[10] * 8] * 2, reflector=Columns()))
 
 
+@pytest.mark.parametrize("call", ["begin", "extend"])
+@pytest.mark.parametrize("score", [float("nan"), 1.5, -0.1])
+def test_scores_that_are_no_probabilities_are_refused(call, score):
+    class Percent(FirstPixel):
+        def begin(self, frames, instructions):
+            state = super().begin(frames, instructions)
+            return state.set("score", state["score"] * 0 + score) if call == "begin" else state
+
+        def extend(self, state, frames):
+            state, scores = super().extend(state, frames)
+            return state, scores * 0 + score
+
+    with pytest.raises(ValueError, match=rf"Percent.{call}: .* must be probabilities, in \[0, 1\], got {score:g}"):
+        roll(reflected([[10] * 8] * 2, reflector=Percent()))
+
+
 # ------------------------------------------------------------------------------------------------- specs
 
 

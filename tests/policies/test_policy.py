@@ -198,3 +198,24 @@ def test_bad_input_is_named(policy, change, message):
 def test_what_no_policy_can_be_trained_for_is_named(settings, message):
     with pytest.raises(ValueError, match=message):
         MLPPolicy(MLPConfig(instructions=INSTRUCTIONS, **settings))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "got"),
+    [
+        (lambda loc, scale: (loc[:, :4], scale), r"\(6, 4, 7\), \(6, 8, 7\)"),
+        (lambda loc, scale: (loc[..., :6], scale[..., :6]), r"\(6, 8, 6\), \(6, 8, 6\)"),
+        (lambda loc, scale: loc, r"\(6, 8, 7\)$"),
+        (lambda loc, scale: (loc, None), r"\(6, 8, 7\), NoneType"),
+    ],
+)
+def test_predictions_of_another_shape_are_named(spoil, got):
+    class Spoiled(MLPPolicy):
+        def predict(self, *observed):
+            return spoil(*super().predict(*observed))
+
+    policy = Spoiled(MLPConfig(instructions=INSTRUCTIONS))
+    with pytest.raises(
+        ValueError, match=r"Spoiled.predict must give loc and log_scale, \(6, 8, 7\) each .* got " + got
+    ):
+        policy(observed())

@@ -51,3 +51,20 @@ def test_what_a_loader_knows_is_not_guessed(tiny):
     swapped = Part(COMPACT.policy.make, load)
     assert swapped.known == () and COMPACT.world_model.known == ("VideoWorldModel",)
     open_run(tiny, dataclasses.replace(COMPACT, policy=swapped)).close()
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"chunk_length": 4}, "OFTPolicy is made for chunk_length=4, the run has chunk_length=8"),
+        ({"image_size": 32}, "OFTPolicy is made for image_size=32, the run has image_size=64"),
+        ({"cameras": ("agentview", "wrist")}, "OFTPolicy looks through wrist, and cameras are agentview"),
+    ],
+)
+def test_a_part_that_is_made_for_another_run_is_refused_before_it_learns(tiny, changed, message):
+    other = dataclasses.replace(tiny, **changed)
+    parts = dataclasses.replace(COMPACT, policy=Part(lambda config: COMPACT.policy.make(other), COMPACT.policy.load))
+    run = open_run(tiny, parts)
+    with pytest.raises(ValueError, match=message):
+        run.new("policy")
+    run.close()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 from small_windows import make_windows
-from swaps.copying_world_model import CopyingConfig
+from swaps.copying_world_model import CopyingConfig as FadingConfig
 from tensordict import TensorDict
 
 import worldenv_trl.world_models
@@ -17,7 +17,7 @@ from worldenv_trl.pretrained import Pretrained
 from worldenv_trl.world_models import Window, WorldModel, memory_key, request
 
 NAMES = {
-    "CopyingConfig": CopyingConfig,
+    "FadingConfig": FadingConfig,
     "Pretrained": Pretrained,
     "TensorDict": TensorDict,
     "Window": Window,
@@ -40,7 +40,7 @@ def shown() -> type[WorldModel]:
 
 def make_fading() -> WorldModel:
     torch.manual_seed(0)
-    return shown()(CopyingConfig(cameras=("agentview", "wrist"), image_size=32, chunk_length=8))
+    return shown()(FadingConfig(cameras=("agentview", "wrist"), image_size=32, chunk_length=8))
 
 
 def make_dimming(model: WorldModel) -> TensorDict:

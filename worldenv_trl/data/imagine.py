@@ -18,7 +18,7 @@ from worldenv_trl.data.store import FrameSink
 from worldenv_trl.devices import device_of, to_device
 from worldenv_trl.keys import frames_key
 from worldenv_trl.kinematics import ForwardKinematics
-from worldenv_trl.world_models import WorldModel, request
+from worldenv_trl.world_models import WorldModel, paint, request
 from worldenv_trl.world_models.noise_seeds import noise_seeds
 
 __all__ = ["imagine_episodes"]
@@ -154,9 +154,8 @@ def _imagine(
             episodes.instructions,
             noise_seed=noise_seeds(seed, numbers, torch.full_like(numbers, start)).unsqueeze(-1).to(device),
         )
-        frames = world_model(asked)
-        for camera in world_model.cameras:
-            video[frames_key(camera)][:, chunk] = frames[frames_key(camera)]
+        for camera, frames in paint(world_model, asked).items():
+            video[frames_key(camera)][:, chunk] = frames
     seen = to_device(video.exclude("poses")[:, : steps + 1], torch.device("cpu"))
     return seen, states[:, : steps + 1].cpu()
 

@@ -9,6 +9,7 @@ from worldenv_trl.data.episodes import Episodes
 from worldenv_trl.devices import device_of
 from worldenv_trl.keys import KINEMATIC_STATES
 from worldenv_trl.reflectors import Reflector
+from worldenv_trl.reflectors.base import check_scores
 
 __all__ = ["score_episodes"]
 
@@ -23,7 +24,7 @@ def score_episodes(reflector: Reflector, episodes: Episodes, *, rows_at_once: in
         rows_at_once: episodes whose frames are in memory at a time.
 
     Raises:
-        ValueError: for episodes that do not show the reflector's cameras at its size.
+        ValueError: for episodes that do not show the reflector's cameras at its size, and scores that are none.
     """
     episodes.require("the reflector", reflector.cameras, reflector.image_size)
     steps = torch.arange(1, episodes["actions"].shape[1] + 1)
@@ -42,6 +43,8 @@ def score_episodes(reflector: Reflector, episodes: Episodes, *, rows_at_once: in
             shown(rows, torch.zeros_like(rows)), [episodes.instructions[row] for row in rows.tolist()]
         )
         start_score = state["score"].clone()
+        check_scores(reflector, "begin", start_score, (len(rows),))
         _, scores = reflector.extend(state, shown(rows.unsqueeze(-1), steps))
+        check_scores(reflector, "extend", scores, (len(rows), len(steps)))
         parts.append(torch.cat([start_score.unsqueeze(-1), scores], 1).cpu())
     return torch.cat(parts)

@@ -36,7 +36,7 @@ from worldenv_trl.keys import (
 )
 from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.language import instructions_of
-from worldenv_trl.world_models import WorldModel, request
+from worldenv_trl.world_models import WorldModel, paint, request
 from worldenv_trl.world_models.noise_seeds import noise_seeds
 
 __all__ = ["ImaginedEnv"]
@@ -224,10 +224,9 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
         row, seeds = rows.unsqueeze(-1), self._noise_seeds(rows)
         text = [self._text[index] for index in rows.tolist()]
         asked = request(self.world_model, lambda numbers: self._recall(row, numbers), now, poses, actions, text, seeds)
-        painted = self.world_model(asked)
+        frames = paint(self.world_model, asked)
         offset = torch.arange(1, length + 1, device=self.device)
         written = now.unsqueeze(-1) + offset
-        frames = {camera: self._checked_frames(painted, camera, count) for camera in self.cameras}
         slot = self._slot[written]
         of, step = (slot >= 0).nonzero(as_tuple=True)
         for camera, video in frames.items():
@@ -264,14 +263,6 @@ class ImaginedEnv(ImaginedStarts, EnvBase):
         for camera in self.cameras:
             out[frames_key(camera)] = self._kept(camera)[row, self._slot[numbers]]
         return out
-
-    def _checked_frames(self, painted: TensorDictBase, camera: str, count: int) -> Tensor:
-        expected = (count, self.chunk_length, 3, self.image_size, self.image_size)
-        frames = painted.get(frames_key(camera), None)
-        if frames is None or tuple(frames.shape) != expected or frames.dtype != torch.uint8:
-            got = "nothing" if frames is None else f"{frames.dtype} {tuple(frames.shape)}"
-            raise ValueError(f"the world model must write {frames_key(camera)} as uint8 {expected}, got {got}")
-        return frames
 
     def _checked_chunk(self, tensordict: TensorDictBase) -> Tensor:
         """The actions [G * N, C, 7] of all rows."""

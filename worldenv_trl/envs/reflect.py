@@ -28,6 +28,7 @@ from worldenv_trl.keys import (
 )
 from worldenv_trl.language import instructions_of
 from worldenv_trl.reflectors import Reflector, StopRule
+from worldenv_trl.reflectors.base import check_scores
 
 __all__ = ["Reflect"]
 
@@ -55,7 +56,7 @@ class Reflect(Transform):
         TypeError: for what is no reflector, or no rule.
         ValueError: when it is put onto an env that does not show what the reflector looks at, or onto imagination that
             the reflector leaves to another one (``for_world``); when a reflector's state or scores are not of the
-            videos that it was given.
+            videos that it was given, or no probabilities.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -121,7 +122,7 @@ class Reflect(Transform):
             goals = [goals[row] for row in rows.tolist()]
             there = device_of(self.reflector, device)
             state = self.reflector.begin({name: shown[rows].to(there) for name, shown in images.items()}, goals)
-            self._check("begin", "state['score']", tuple(state["score"].shape), (len(rows),))
+            check_scores(self.reflector, "begin", state["score"], (len(rows),))
             memory["state"] = _merged(memory["state"], rows, state, count)
             memory["prob"][rows], memory["streak"][rows] = state["score"].float().to(device), 0
         tensordict_reset[SUCCESS_PROB] = memory["prob"].reshape(*batch, 1).clone()
@@ -174,7 +175,7 @@ class Reflect(Transform):
         memory, whole = self._memory, len(self._memory["prob"])
         # Frames behind a row's end are extended by, too: the row is not stepped again before its reset.
         state, scores = self.reflector.extend(memory["state"] if len(rows) == whole else memory["state"][rows], frames)
-        self._check("extend", "scores", tuple(scores.shape), tuple(executed.shape))
+        check_scores(self.reflector, "extend", scores, tuple(executed.shape))
         scores = scores.float().to(executed.device)
         memory["state"] = _merged(memory["state"], rows, state, whole)
         stop, last, streak = self.rule.extend(memory["streak"][rows], scores, executed)
@@ -199,10 +200,6 @@ class Reflect(Transform):
         steps[rows] -= executed.sum(-1, keepdim=True) - kept.sum(-1, keepdim=True)
         mask[rows] = kept
         out[STEP_MASK], out[NUM_STEPS] = mask.reshape(out[STEP_MASK].shape), steps.reshape(out[NUM_STEPS].shape)
-
-    def _check(self, call: str, name: str, got: tuple[int, ...], expected: tuple[int, ...]) -> None:
-        if got != expected:
-            raise ValueError(f"{type(self.reflector).__name__}.{call}: {name} must be {expected}, got {got}")
 
     # ------------------------------------------------------------------------------------------------- specs
 

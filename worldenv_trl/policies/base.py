@@ -43,7 +43,7 @@ class Policy(TensorDictModuleBase, abc.ABC):
 
     Raises:
         ValueError: for no camera, one that is named twice, a size below 1, or another kind of proprioception; when
-            called, for an image that is missing, and images or states of another size.
+            called, for an image that is missing, and images, states or predictions of another size.
     """
 
     action_range: Tensor
@@ -117,10 +117,22 @@ class Policy(TensorDictModuleBase, abc.ABC):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         batch, observed = self.observed(tensordict)
-        loc, log_scale = self.predict(*observed)
+        loc, log_scale = self._of_shape(self.predict(*observed), batch.numel())
         shape = (*batch, self.chunk_length, ACTION_DIM)
         tensordict.set(LOC, loc.float().reshape(shape))
         return tensordict.set(LOG_SCALE, log_scale.float().reshape(shape))
+
+    def _of_shape(self, predicted: tuple[Tensor, Tensor], rows: int) -> tuple[Tensor, Tensor]:
+        shape = (rows, self.chunk_length, ACTION_DIM)
+        values = predicted if isinstance(predicted, tuple) else (predicted,)
+        found = [tuple(each.shape) if isinstance(each, Tensor) else type(each).__name__ for each in values]
+        if found == [shape, shape]:
+            return predicted
+        got = ", ".join(map(str, found))
+        raise ValueError(
+            f"{type(self).__name__}.predict must give loc and log_scale, {shape} each for {rows} rows and its "
+            f"chunk_length of {self.chunk_length}, got {got}"
+        )
 
     def observed(self, tensordict: TensorDictBase) -> tuple[torch.Size, tuple[dict[str, Tensor], Tensor, list[str]]]:
         """The batch size of a TensorDict [*B], and what :meth:`predict` takes of it, rows flattened.

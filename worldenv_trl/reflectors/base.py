@@ -137,3 +137,14 @@ class Reflector(nn.Module, abc.ABC):
     def training_loss(self, batch: TensorDictBase) -> TensorDict:
         """``loss_reflector`` (scalar) and the detached ``accuracy`` of a batch that a lesson drew."""
         raise TypeError(f"{type(self).__name__} is not trained: it has no lessons")
+
+
+def check_scores(reflector: Reflector, call: str, scores: Tensor, shape: tuple[int, ...]) -> None:
+    """Raises ``ValueError`` unless what a reflector's ``begin`` or ``extend`` gave are probabilities of that shape."""
+    what = "state['score']" if call == "begin" else "scores"
+    name = f"{type(reflector).__name__}.{call}: {what}"
+    if tuple(scores.shape) != shape:
+        raise ValueError(f"{name} must be {shape}, got {tuple(scores.shape)}")
+    inside = (scores >= 0) & (scores <= 1)  # NaN is not
+    if not bool(inside.all()):
+        raise ValueError(f"{name} must be probabilities, in [0, 1], got {scores[~inside][0].item():g}")

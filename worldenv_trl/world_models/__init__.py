@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from worldenv_trl.world_models.base import WorldModel, memory_key, reference_key, request
+from worldenv_trl.world_models.base import WorldModel, memory_key, paint, reference_key, request
 from worldenv_trl.world_models.diffusion_config import DiffusionWorldModelConfig
 from worldenv_trl.world_models.diffusion_weights import load_diffusers
 from worldenv_trl.world_models.diffusion_world_model import DiffusionWorldModel
@@ -18,6 +18,7 @@ __all__ = [
     "WorldModel",
     "load_diffusers",
     "memory_key",
+    "paint",
     "reference_key",
     "request",
 ]

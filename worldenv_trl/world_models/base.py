@@ -14,7 +14,7 @@ from worldenv_trl.keys import ACTION_DIM, INSTRUCTION, NOISE_SEED, frames_key, i
 from worldenv_trl.language import SeenInstructions
 from worldenv_trl.row_texts import row_texts
 
-__all__ = ["PADDED_ACTIONS", "PADDED_ACTION_DIM", "POSES", "Recall", "WorldModel", "request"]
+__all__ = ["PADDED_ACTIONS", "PADDED_ACTION_DIM", "POSES", "Recall", "WorldModel", "paint", "request"]
 
 POSES = "poses"  # float32 [n, C, 13], FK-predicted: position (m), rotation (row-major), opening
 PADDED_ACTIONS = "padded_actions"  # float32 [n, C, 14]
@@ -154,3 +154,24 @@ def request(
     if noise_seed is not None:
         out[NOISE_SEED] = noise_seed
     return out
+
+
+def paint(world_model: WorldModel, asked: TensorDictBase) -> dict[str, Tensor]:
+    """What a world model makes of a :func:`request` [n]: uint8 [n, C, 3, H, W] by camera.
+
+    Raises:
+        ValueError: for frames that are missing, or not of its own size and length.
+    """
+    size = world_model.image_size
+    expected = (*asked.batch_size, world_model.chunk_length, 3, size, size)
+    painted, frames = world_model(asked), dict[str, Tensor]()
+    for camera in world_model.cameras:
+        video = painted.get(frames_key(camera), None)
+        if video is None or tuple(video.shape) != expected or video.dtype != torch.uint8:
+            got = "nothing" if video is None else f"{video.dtype} {tuple(video.shape)}"
+            raise ValueError(
+                f"the world model {type(world_model).__name__} must write {frames_key(camera)} as uint8 {expected}, "
+                f"got {got}"
+            )
+        frames[camera] = video
+    return frames
