@@ -7,7 +7,7 @@ from config import WorldEnvConfig
 from data_parallel import MODES
 from libero_files import check_files, from_libero
 from loggers import check_loggers
-from parts import COMPACT, Parts
+from parts import COMPACT, Parts, check_fits
 from physics import tabletop
 from ranges import check_ranges
 from worldenv_trl.data import ACTIONS
@@ -74,6 +74,8 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         RuntimeError: if nothing can be drawn.
     """
     choose_device(config.device)
+    if not config.cameras:
+        raise ValueError("cameras is empty: name at least one, for instance agentview")
     if not config.tasks:
         raise ValueError("tasks is empty: name at least one task, for instance starter/open_the_top_drawer")
     if len(set(config.tasks)) < len(config.tasks):
@@ -102,6 +104,8 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
             f"demonstrate.episodes_per_task must be at most {config.train_states}, train_states, where the states are "
             f"spread, got {wanted}"
         )
+    if not 32 <= config.image_size <= 4096 or config.image_size % 16:
+        raise ValueError(f"image_size must be a multiple of 16 px from 32 to 4096, got {config.image_size}")
     if not 0 <= config.sft.shift_px < config.image_size:
         raise ValueError(
             f"sft.shift_px must be at least 0 and less than image_size, {config.image_size}, got {config.sft.shift_px}"
@@ -141,8 +145,6 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         StopRule(config.reflector.threshold, config.reflector.consecutive)
     except ValueError as error:
         raise ValueError(f"reflector.{error}") from error
-    if config.image_size < 32 or config.image_size % 16:
-        raise ValueError(f"image_size must be a multiple of 16 px and at least 32, got {config.image_size}")
     if config.max_steps % config.chunk_length:
         raise ValueError(f"max_steps must be a multiple of chunk_length={config.chunk_length}, got {config.max_steps}")
     check_loggers(config.logger)
@@ -167,6 +169,7 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
         if make is not None:
             try:
                 made = make(config)
+                check_fits(config, made)
                 if name == "policy":
                     check_loop(config, made)
             except ValueError as error:

@@ -26,6 +26,7 @@ from run_folder import RunFolder
 from stage_plan import Machine, StagePlan, decisions, iteration_flops, moved_bytes, stage_plans, wave_bytes
 from stages import plan
 from task_names import with_tasks
+from worldenv_trl.devices import check_device_name
 
 _HERE = "here"
 _TITLES = {"policy": "policy", "world_model": "world model", "reflector": "reflector"}
@@ -63,6 +64,7 @@ def dry_run(config: WorldEnvConfig, chosen: argparse.Namespace, parts: Parts | N
         config = with_tasks(config)
         parts = parts_of(config) if parts is None else parts
         machine = _machine(config, chosen)
+        check_device_name(config.device)
         # Whether this machine has the run's device says nothing of another one; the parts are built below.
         bare = replace(parts, **{name: replace(getattr(parts, name), outline=None) for name in _TITLES})
         check_config(replace(config, device="cpu"), bare)

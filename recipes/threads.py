@@ -11,6 +11,16 @@ OF_A_WORKER = 1
 VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
+def check_threads(count: int) -> None:
+    """Raises ``ValueError`` for less than one thread, and for many more than this machine has cores for."""
+    cores = os.cpu_count() or 1
+    most = max(16, 4 * cores)
+    if not 1 <= count <= most:
+        raise ValueError(
+            f"--num-threads must be at least 1, and at most {most} on this machine of {cores} cores, got {count}"
+        )
+
+
 def use_threads(count: int) -> None:
     """Lets torch compute with ``count`` threads, and OpenMP, MKL and OpenBLAS in processes that start from now on.
 
@@ -18,9 +28,8 @@ def use_threads(count: int) -> None:
     its threads before, NumPy's OpenBLAS for one, keeps them. A replay computes with as many as its recording did.
 
     Raises:
-        ValueError: if ``count`` is below 1.
+        ValueError: see :func:`check_threads`.
     """
-    if count < 1:
-        raise ValueError(f"--num-threads must be at least 1, got {count}")
+    check_threads(count)
     torch.set_num_threads(count)
     os.environ.update(dict.fromkeys(VARIABLES, str(count)))

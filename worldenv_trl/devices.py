@@ -8,7 +8,7 @@ import torch
 from tensordict import LazyStackedTensorDict, TensorDictBase, is_non_tensor
 from torch import nn
 
-__all__ = ["choose_device", "device_of", "to_device"]
+__all__ = ["check_device_name", "choose_device", "device_of", "to_device"]
 
 Batch = TypeVar("Batch", bound=TensorDictBase)
 
@@ -27,9 +27,8 @@ def choose_device(name: str) -> torch.device:
             ...
         ValueError: device must be auto, cpu, cuda or cuda:N, got 'gpu'
     """
-    kind, colon, number = name.partition(":")
-    if not (name in ("auto", "cpu", "cuda") or (kind == "cuda" and colon and number.isascii() and number.isdigit())):
-        raise ValueError(f"device must be auto, cpu, cuda or cuda:N, got {name!r}")
+    check_device_name(name)
+    _, colon, number = name.partition(":")
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
     if not torch.cuda.is_available():
@@ -41,6 +40,13 @@ def choose_device(name: str) -> torch.device:
         known = "cuda:0" if count == 1 else f"cuda:0 to cuda:{count - 1}"
         raise ValueError(f"device {name!r} does not exist, this machine has {known}: use one of these, auto or cpu")
     return torch.device("cuda", index)
+
+
+def check_device_name(name: str) -> None:
+    """Raises ``ValueError`` for what no machine's device is called."""
+    kind, colon, number = name.partition(":")
+    if not (name in ("auto", "cpu", "cuda") or (kind == "cuda" and colon and number.isascii() and number.isdigit())):
+        raise ValueError(f"device must be auto, cpu, cuda or cuda:N, got {name!r}")
 
 
 def device_of(module: nn.Module, default: torch.device | str = "cpu") -> torch.device:

@@ -58,7 +58,8 @@ def test_of_a_run_that_has_begun_the_rest_is_planned_and_other_settings_are_refu
     [
         (["--gpus", "0"], "--gpus must be at least 1, got 0"),
         (["--matmul-share", "1.5"], "--matmul-share must lie above 0 and at most at 1, got 1.5"),
-        (["--image-size", "100"], "image_size must be a multiple of 16 px and at least 32, got 100"),
+        (["--image-size", "100"], "image_size must be a multiple of 16 px from 32 to 4096, got 100"),
+        (["--device", "gpu"], "device must be auto, cpu, cuda or cuda:N, got 'gpu'"),
         (["--parts", "large"], "parts must be one of compact, real-size, got 'large'"),
     ],
 )

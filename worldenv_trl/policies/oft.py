@@ -77,10 +77,10 @@ class OFTConfig:
                 raise ValueError(f"max_words={self.max_words} is less than the words of the instruction {text!r}")
         if self.image_size < 16 or self.image_size % 4:
             raise ValueError(f"image_size must be a multiple of 4 px and at least 16, got {self.image_size}")
-        if len(self.stem_widths) < 2 or self.depth < 1:
-            raise ValueError(
-                f"stem_widths needs two entries and depth one at least, got {self.stem_widths}, {self.depth}"
-            )
+        if self.depth < 1:
+            raise ValueError(f"depth must be at least 1, got {self.depth}")
+        if len(self.stem_widths) < 2:
+            raise ValueError(f"stem_widths needs two entries at least, got {self.stem_widths}")
         if self.dim < 1 or self.num_heads < 1 or self.dim % self.num_heads:
             raise ValueError(f"dim must be a positive multiple of num_heads={self.num_heads}, got {self.dim}")
         if not self.vocabulary:

@@ -32,6 +32,7 @@ _STAGES = (
     _Stage(4, 5, 2, 6, 192),
     _Stage(1, 3, 1, 6, 320),
 )
+BLOCKS = sum(stage.repeats for stage in _STAGES)
 
 
 class EfficientNetLite0(nn.Module):
@@ -50,9 +51,8 @@ class EfficientNetLite0(nn.Module):
 
     def __init__(self, depth: int = 16) -> None:
         super().__init__()
-        total = sum(stage.repeats for stage in _STAGES)
-        if not 1 <= depth <= total:
-            raise ValueError(f"depth must lie between 1 and {total}, got {depth}")
+        if not 1 <= depth <= BLOCKS:
+            raise ValueError(f"depth must lie between 1 and {BLOCKS}, got {depth}")
         self.stem = _Convolution(3, _STEM, 3, stride=2)
         self.blocks = nn.ModuleList()
         self.widths: list[int] = []

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from worldenv_trl.vision.efficientnet_lite import EfficientNetLite0
+from worldenv_trl.vision.efficientnet_lite import BLOCKS, EfficientNetLite0
 
 __all__ = ["PretrainedEncoder", "load_vision"]
 
@@ -43,8 +43,9 @@ class PretrainedEncoder(nn.Module):
     def __init__(self, blocks: Sequence[int] = (2, 4, 10)) -> None:
         super().__init__()
         self.block_numbers = tuple(int(block) for block in blocks)
-        if not blocks or min(blocks) < 0 or list(blocks) != sorted(set(blocks)):
-            raise ValueError(f"blocks must be ascending numbers of 0 to 15, one at least, got {tuple(blocks)}")
+        if not blocks or min(blocks) < 0 or max(blocks) >= BLOCKS or list(blocks) != sorted(set(blocks)):
+            last = BLOCKS - 1
+            raise ValueError(f"blocks must be ascending numbers of 0 to {last}, one at least, got {tuple(blocks)}")
         self.net = EfficientNetLite0(self.block_numbers[-1] + 1).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.widths = tuple(self.net.widths[block] for block in self.block_numbers)
         self.strides = tuple(self.net.strides[block] for block in self.block_numbers)
