@@ -13,12 +13,12 @@ VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 def check_threads(count: int) -> None:
     """Raises ``ValueError`` for less than one thread, and for many more than this machine has cores for."""
+    if count < 1:
+        raise ValueError(f"--num-threads must be at least 1, got {count}")
     cores = os.cpu_count() or 1
     most = max(16, 4 * cores)
-    if not 1 <= count <= most:
-        raise ValueError(
-            f"--num-threads must be at least 1, and at most {most} on this machine of {cores} cores, got {count}"
-        )
+    if count > most:
+        raise ValueError(f"--num-threads must be at most {most} on this machine of {cores} cores, got {count}")
 
 
 def use_threads(count: int) -> None:

@@ -47,14 +47,12 @@ def test_a_run_computes_with_the_threads_of_its_settings(tiny):
 
 
 def test_less_than_one_is_refused():
-    with pytest.raises(ValueError, match=r"--num-threads must be at least 1, and at most .*, got 0"):
+    with pytest.raises(ValueError, match="--num-threads must be at least 1, got 0"):
         threads.use_threads(0)
 
 
 def test_many_more_than_there_are_cores_for_are_refused_before_the_folder_is_made(tiny):
-    with pytest.raises(
-        SystemExit, match=r"--num-threads must be at least 1, and at most \d+ on this machine of .* 5000"
-    ):
+    with pytest.raises(SystemExit, match=r"--num-threads must be at most \d+ on this machine of .* 5000"):
         open_run(dataclasses.replace(tiny, num_threads=5000))
     assert not tiny.run_dir.exists()
 
