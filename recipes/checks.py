@@ -135,6 +135,10 @@ def check_config(config: WorldEnvConfig, parts: Parts = COMPACT) -> None:
     ):
         if asked and 0.0 not in config.explore.scale_factors:
             raise ValueError(f"{setting} {why}: explore.scale_factors must hold 0, got {factors}")
+    if config.post_train.trust and not config.post_train.hold:
+        raise ValueError(
+            f"post_train.trust={config.post_train.trust:g} holds tasks: post_train.hold must be above 0, for instance 1"
+        )
     if config.post_train.env == "tabletop":
         for name, count, least in (("adapt.steps", config.adapt.steps, 0), ("rounds", config.rounds, 1)):
             if count > least:

@@ -193,6 +193,9 @@ class PostTrain:
     solves; their returns are not learned from. At 0 nothing is held."""
     hold_from: float = 0.85
     """A task is solved if this share of its greedy rollouts in exploration reached the goal."""
+    trust: float = 0.0
+    """Least agreement (Cohen's kappa) of imagination's verdicts with exploration's greedy outcomes (``trust.py``) by
+    which a task is learned from; others are held like solved ones. At 0 nobody asks; in the physics neither."""
     noise: str = "step"
     """Of the Laplace density that is sampled and scored: ``step``, each step's own (World-Env Eq. 2), or ``chunk``, one
     displacement for all steps of a chunk, whose ratio each of them has (``policies.ChunkLaplace``). Policies that act

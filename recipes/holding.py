@@ -3,7 +3,8 @@ there is nothing to win.
 
 Sampled rollouts say little of the greedy policy, whom noise no longer helps past a place where it hesitates, and an
 imagined one is right by and large. Exploration's greedy rollouts were real: on tasks that they solve the policy keeps
-its means, and it learns from the others. Leaving those tasks out would not do, for then they are forgotten.
+its means, and so it does on those of which imagination knows too little (``trust.py``); it learns from the others.
+Leaving those tasks out would not do, for then they are forgotten.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from torch import Tensor
 
 import processes
 from episodes import explored_at, round_of
+from imagination import Imagination
 from physics import exploring_actor
 from run import Run
+from trust import agreement
 from updates import rows_of
 from worldenv_trl import keys
 from worldenv_trl.data import Episodes
@@ -30,32 +33,52 @@ class Hold:
     Args:
         source: that policy's checkpoint, a copy of which is kept.
         models: suffix of the round, whose exploration is asked.
+        imagination: where LOOP learns, which with ``post_train.trust`` is asked, too; None in the physics.
 
     Attributes:
         everything: whether all tasks are held, so that there is nothing to learn.
     """
 
-    def __init__(self, run: Run, source: str, models: str) -> None:
-        policy = run.policy(source).eval()
-        self._actor = exploring_actor(run.config, policy, run.config.post_train.scale_factor)
+    def __init__(self, run: Run, source: str, models: str, imagination: Imagination | None = None) -> None:
+        policy, settings = run.policy(source).eval(), run.config.post_train
+        self._actor = exploring_actor(run.config, policy, settings.scale_factor)
         shares = greedy_shares(run, models)
-        held = _enough(run, shares)
-        self._tasks, self.everything = torch.tensor(held, dtype=torch.long), len(held) == len(run.config.tasks)
-        if self.everything:
+        solved, unknown = _enough(run, shares), list[int]()
+        if imagination is not None and settings.trust:
+            unknown = self._unknown(run, imagination, models, [task for task in shares if task not in solved])
+        held, count = solved + unknown, len(run.config.tasks)
+        self._tasks, self.everything = torch.tensor(held, dtype=torch.long), len(held) == count
+        if len(solved) == count:
             warnings.warn(
                 f"all tasks are held, so adapting and LOOP are left out: greedy exploration solved at least "
                 f"{min(shares.values()):.2f} of each; a new run with --begin-from {run.folder.path} and "
                 "--post-train.hold 0, or with a higher --post-train.hold-from, learns",
                 stacklevel=2,
             )
+        elif self.everything:
+            warnings.warn(
+                f"all tasks are held, {len(solved)} solved and {len(unknown)} unknown to imagination, so LOOP is left "
+                f"out and the policy stays what {source} is; a new run with --begin-from {run.folder.path} and a lower "
+                "--post-train.trust learns",
+                stacklevel=2,
+            )
         elif not held:
             warnings.warn(
                 f"no task is held: greedy exploration solved at most {max(shares.values()):.2f} of one, and "
-                f"--post-train.hold-from is {run.config.post_train.hold_from:g}",
+                f"--post-train.hold-from is {settings.hold_from:g}",
                 stacklevel=2,
             )
-        elif processes.is_main():
-            print("held: " + ", ".join(f"{run.config.tasks[n]} ({shares[n]:.2f})" for n in held))
+        elif processes.is_main() and solved:
+            print("held: " + ", ".join(f"{run.config.tasks[n]} ({shares[n]:.2f})" for n in solved))
+
+    def _unknown(self, run: Run, imagination: Imagination, models: str, tasks: list[int]) -> list[int]:
+        """Those of ``tasks`` of which imagination does not know enough, which is printed."""
+        agreed = processes.on_main(lambda: agreement(run, imagination, models, tasks))
+        unknown = [task for task in tasks if not agreed[task] >= run.config.post_train.trust]
+        names = ", ".join(f"{run.config.tasks[task]} ({agreed[task]:.2f})" for task in unknown)
+        if unknown and processes.is_main():
+            print(f"imagination's verdicts and exploration's outcomes agree too little to learn from: {names}")
+        return unknown
 
     def groups(self, wave: TensorDictBase) -> Tensor:
         """Bool [G]: the groups of a wave [G, N, T] whose task is held."""

@@ -18,6 +18,7 @@ import processes
 from averaging import RunningMean
 from data_parallel import DataParallel, WholeOptimizer
 from holding import Hold
+from imagination import Imagination
 from physics import exploring_actor, recording
 from probes import probe, probed_iterations, warning
 from resumable import Resumable
@@ -57,7 +58,8 @@ def post_train(
             that would be saved now, which it must leave as it is, like torch's random numbers.
     """
     config, settings = run.config, run.config.post_train
-    hold = Hold(run, source, models) if settings.hold else None
+    imagination = Imagination.load(run, models) if settings.env == "imagined" else None
+    hold = Hold(run, source, models, imagination) if settings.hold else None
     run.seed_everything(target, another_draw(settings.draw))
     policy = run.policy(source)
     if hold is not None and hold.everything:
@@ -73,8 +75,7 @@ def post_train(
             parameter.requires_grad_(False)
     actor = exploring_actor(config, policy, settings.scale_factor, settings.noise)
 
-    waves = Waves(run, target, models, actor)
-    imagination = waves.imagination
+    waves = Waves(run, target, imagination, actor)
     read = [*policy.in_keys, *([keys.TOKENS] if isinstance(policy, TokenPolicy) else [])]
     read += [key for key in (keys.TOKEN_IS_PAD,) if key in actor.out_keys]
 

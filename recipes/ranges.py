@@ -99,6 +99,7 @@ RANGES: dict[str, Range] = {
     "post_train.draw": _ZERO,
     "post_train.hold": _WEIGHT,
     "post_train.hold_from": _SHARE,
+    "post_train.trust": Range(0, 1, below=True),
     "post_train.scale_factor": _RATE,
     "post_train.warmup_iterations": _ZERO,
     "post_train.max_kl": Range(0, above=True),

@@ -38,30 +38,30 @@ _LEARNED_FROM = (
 
 
 class Waves:
-    """The waves of a post-training run, one an iteration.
+    """The waves of a post-training run in imagination, or in the physics where there is none, one an iteration.
 
     Attributes:
         env: in which this process collects; None where another one does.
         collector: as above.
-        imagination: what is learned in; None for the physics.
         judges: the parts that give a rollout its return, by name.
     """
 
     env: EnvBase | None = None
     collector: GroupCollector | None = None
-    imagination: Imagination | None = None
 
-    def __init__(self, run: Run, target: str, models: str, actor: LaplaceActor | AutoregressiveActor) -> None:
+    def __init__(
+        self, run: Run, target: str, imagination: Imagination | None, actor: LaplaceActor | AutoregressiveActor
+    ) -> None:
         settings, size = run.config.post_train, run.config.post_train.group_size
         self._groups, self._read = settings.groups // processes.size(), [*actor.policy.in_keys, *_LEARNED_FROM]
+        self._lived = imagination is None
         self._workers, seed = run.workers is not None, run.seed(target, another_draw(settings.draw, "env"))
         self.judges: dict[str, Any] = {}
         make: Callable[..., EnvBase]
-        if settings.env == "imagined":
-            self.imagination = Imagination.load(run, models)
-            self.env = self.imagination.env(run, [self._groups, size], seed=seed)
-            make = self.imagination.makes(run, size, seed=seed)
-            self.judges = {"world_model": self.imagination.world_model, "reflector": self.imagination.reflector}
+        if imagination is not None:
+            self.env = imagination.env(run, [self._groups, size], seed=seed)
+            make = imagination.makes(run, size, seed=seed)
+            self.judges = {"world_model": imagination.world_model, "reflector": imagination.reflector}
             mine = self._groups
         elif processes.is_main():
             self.env = physics_waves_env(run.config, settings.groups, size, seed=seed)
@@ -99,7 +99,7 @@ class Waves:
         """
         collected = iter(()) if self.collector is None else iter(self.collector)
         while True:
-            if self.imagination is None and processes.size() > 1:
+            if self._lived and processes.size() > 1:
                 yield self._dealt(collected)
                 continue
             with processes.sharing():

@@ -26,6 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from command_line import at_least, refusals
 from gather_evidence import read_config
+from imagination import Imagination
 from learning_curves import bootstrap_interval
 from parts import instructions
 from physics import exploring_actor
@@ -112,7 +113,8 @@ def lived(run: Run, policy: Policy, actor: LaplaceActor, world: str, seed: int, 
         config = dataclasses.replace(run.config, seed=seed)
         config = dataclasses.replace(config, post_train=dataclasses.replace(config.post_train, env=world))
         torch.manual_seed(run.seed("ascent", str(seed)))
-        waves = Waves(dataclasses.replace(run, config=config), "ascent", "", actor)
+        imagination = Imagination.load(run, "") if world == "imagined" else None
+        waves = Waves(dataclasses.replace(run, config=config), "ascent", imagination, actor)
         waves.record_next(False)
         decisions = -(-config.max_steps // config.chunk_length)
         parts = [_kept(wave, policy, decisions) for wave, _ in waves]
