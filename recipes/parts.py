@@ -62,18 +62,34 @@ class Parts:
     kinematics: Callable[[], ForwardKinematics] = ForwardKinematics
 
 
-def check_fits(config: WorldEnvConfig, part: nn.Module) -> None:
-    """Raises ``ValueError`` for a part that was made for other cameras, images or chunks than the run has."""
-    cameras = [camera for camera in getattr(part, "cameras", ()) if camera not in config.cameras]
-    if cameras:
-        raise ValueError(
-            f"{type(part).__name__} looks through {', '.join(cameras)}, and cameras are {', '.join(config.cameras)}: "
-            "make it for some of these, or add it to cameras"
+def misfits(config: WorldEnvConfig, part: nn.Module) -> list[str]:
+    """What a part was made for that the run has otherwise, a line each, with the setting that helps."""
+    seen: Any = part
+    lines, missing = [], [camera for camera in seen.cameras if camera not in config.cameras]
+    if missing:
+        lines.append(
+            f"it looks through {', '.join(seen.cameras)}, the run's cameras are {', '.join(config.cameras)}: "
+            f"--cameras {' '.join(dict.fromkeys((*config.cameras, *missing)))}"
         )
-    for name in ("image_size", "chunk_length"):
-        made, wanted = getattr(part, name, None), getattr(config, name)
-        if made not in (None, wanted):
-            raise ValueError(f"{type(part).__name__} is made for {name}={made}, the run has {name}={wanted}")
+    if seen.image_size not in (None, config.image_size):
+        lines.append(
+            f"its images are of {seen.image_size} px, the run's of {config.image_size}: --image-size {seen.image_size}"
+        )
+    length = getattr(seen, "chunk_length", config.chunk_length)
+    if length != config.chunk_length:
+        lines.append(
+            f"chunk lengths differ, its is {length}, the run's {config.chunk_length}: --chunk-length {length}, with "
+            "--max-steps a multiple of it"
+        )
+    if getattr(seen, "proprio", PROPRIO) != PROPRIO:
+        lines.append(f"it was made for {seen.proprio} proprioception, the run's is {PROPRIO}")
+    return lines
+
+
+def check_fits(config: WorldEnvConfig, part: nn.Module) -> None:
+    """Raises ``ValueError`` with the first of the :func:`misfits`."""
+    for line in misfits(config, part):
+        raise ValueError(f"{type(part).__name__}: {line}")
 
 
 def instructions(config: WorldEnvConfig) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from command_line import expected, in_options
 from config import WorldEnvConfig
 from explore import episodes_of_round
 from part_costs import Call, Size, counted, size
-from parts import PROPRIO, Parts, instructions
+from parts import Parts, instructions, misfits
 from worldenv_trl import keys
 from worldenv_trl.data import Episodes
 from worldenv_trl.devices import device_of
@@ -27,7 +27,7 @@ from worldenv_trl.kinematics import ForwardKinematics
 from worldenv_trl.policies import Policy, TeacherForcing, TokenPolicy, token_cross_entropy
 from worldenv_trl.reflectors import Reflector, VLMReflector
 from worldenv_trl.row_texts import row_texts
-from worldenv_trl.world_models import DiffusionWorldModel, WorldModel, request
+from worldenv_trl.world_models import DiffusionWorldModel, WorldModel, paint, request
 from worldenv_trl.world_models.diffusion_training import denoising_loss
 
 ROWS = 2  # everything counted grows with them alike
@@ -106,25 +106,7 @@ def _agree(found: Rehearsal, config: WorldEnvConfig, made: dict[str, Any]) -> No
     texts = instructions(config)
     for name, part in made.items():
         title = name.replace("_", " ")
-        missing = [camera for camera in part.cameras if camera not in config.cameras]
-        if missing:
-            found.problems.append(
-                f"{title}: it looks through {', '.join(part.cameras)}, the run's cameras are "
-                f"{', '.join(config.cameras)}: --cameras {' '.join(dict.fromkeys((*config.cameras, *missing)))}"
-            )
-        if part.image_size not in (None, config.image_size):
-            found.problems.append(
-                f"{title}: its images are of {part.image_size} px, the run's of {config.image_size}: "
-                f"--image-size {part.image_size}"
-            )
-        length = getattr(part, "chunk_length", config.chunk_length)
-        if length != config.chunk_length:
-            found.problems.append(
-                f"{title}: chunk lengths differ, its is {length}, the run's {config.chunk_length}: "
-                f"--chunk-length {length}, with --max-steps a multiple of it"
-            )
-        if getattr(part, "proprio", PROPRIO) != PROPRIO:
-            found.problems.append(f"{title}: it was made for {part.proprio} proprioception, the run's is {PROPRIO}")
+        found.problems += [f"{title}: {line}" for line in misfits(config, part)]
         unseen = [text for text in texts if part.instructions and text not in part.instructions]
         if unseen:
             found.problems.append(f"{title}: it was not made for the instruction {unseen[0]!r}")
@@ -190,11 +172,8 @@ def _imagine(found: Rehearsal, config: WorldEnvConfig, made: dict[str, Any]) -> 
     found.rows_imagined = config.post_train.groups * config.post_train.group_size
     if isinstance(model, DiffusionWorldModel):
         found.rows_imagined = model.config.rows_at_once(device)
-    found.calls["imagine"] = counted(model, ROWS, lambda: made.update(painted=model(asked)))
-    for camera in model.cameras:
-        frames, wanted = made["painted"][keys.frames_key(camera)], _pixels(config, ROWS, config.chunk_length)
-        if frames.shape != wanted.shape or frames.dtype != torch.uint8:
-            raise ValueError(f"the world model must paint {camera} as uint8 {_shape(wanted)}, got {_shape(frames)}")
+    found.calls["imagine"] = counted(model, ROWS, lambda: made.update(painted=paint(model, asked)))
+    frames = made["painted"][model.cameras[0]]
     found.shapes += [
         f"forward kinematics: chunk {_shape(chunk)} -> poses {_shape(poses)}",
         f"world model: {asked.batch_size[0]} requests of {', '.join(model.cameras)} -> frames {_shape(frames)}",
@@ -241,7 +220,7 @@ def _judge(found: Rehearsal, config: WorldEnvConfig, made: dict[str, Any]) -> No
             f"it looks through {', '.join(reflector.cameras)}, the world model paints "
             f"{', '.join(made['world_model'].cameras)} alone: name these cameras in its settings"
         )
-    frames = {camera: painted[keys.frames_key(camera)].to(device) for camera in reflector.cameras}
+    frames = {camera: painted[camera].to(device) for camera in reflector.cameras}
     count = ROWS * config.chunk_length
     if isinstance(reflector, VLMReflector):
         found.sizes["reflector"] = size(reflector, reflector.head.parameters())

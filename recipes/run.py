@@ -94,7 +94,7 @@ class Run:
         """The ``policy``, ``world_model`` or ``reflector`` of the run's parts, untrained.
 
         Raises:
-            ValueError: for one that is made for other cameras, images or chunks than the run has.
+            ValueError: for one that is made for other cameras, images, chunks or proprioception than the run has.
         """
         part = getattr(self.parts, name).make(self.config)
         check_fits(self.config, part)

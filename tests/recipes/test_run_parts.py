@@ -56,9 +56,12 @@ def test_what_a_loader_knows_is_not_guessed(tiny):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"chunk_length": 4}, "OFTPolicy is made for chunk_length=4, the run has chunk_length=8"),
-        ({"image_size": 32}, "OFTPolicy is made for image_size=32, the run has image_size=64"),
-        ({"cameras": ("agentview", "wrist")}, "OFTPolicy looks through wrist, and cameras are agentview"),
+        ({"chunk_length": 4}, "OFTPolicy: chunk lengths differ, its is 4, the run's 8: --chunk-length 4"),
+        ({"image_size": 32}, "OFTPolicy: its images are of 32 px, the run's of 64: --image-size 32"),
+        (
+            {"cameras": ("agentview", "wrist")},
+            "it looks through agentview, wrist, .*: --cameras agentview wrist",
+        ),
     ],
 )
 def test_a_part_that_is_made_for_another_run_is_refused_before_it_learns(tiny, changed, message):
