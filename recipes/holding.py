@@ -44,7 +44,7 @@ class Hold:
         self._actor = exploring_actor(run.config, policy, settings.scale_factor)
         shares = greedy_shares(run, models)
         solved, unknown = _enough(run, shares), list[int]()
-        if imagination is not None and settings.trust:
+        if imagination is not None and settings.trust and len(solved) < len(run.config.tasks):
             unknown = self._unknown(run, imagination, models, [task for task in shares if task not in solved])
         held, count = solved + unknown, len(run.config.tasks)
         self._tasks, self.everything = torch.tensor(held, dtype=torch.long), len(held) == count

@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 import processes
 from averaging import RunningMean
 from data_parallel import DataParallel, WholeOptimizer
-from holding import Hold
+from holding import Hold, all_held
 from imagination import Imagination
 from physics import exploring_actor, recording
 from probes import probe, probed_iterations, warning
@@ -58,7 +58,8 @@ def post_train(
             that would be saved now, which it must leave as it is, like torch's random numbers.
     """
     config, settings = run.config, run.config.post_train
-    imagination = Imagination.load(run, models) if settings.env == "imagined" else None
+    learns = settings.env == "imagined" and not all_held(run, models)
+    imagination = Imagination.load(run, models) if learns else None
     hold = Hold(run, source, models, imagination) if settings.hold else None
     run.seed_everything(target, another_draw(settings.draw))
     policy = run.policy(source)

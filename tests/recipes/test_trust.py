@@ -94,6 +94,13 @@ def test_a_task_that_imagination_does_not_know_is_held_like_a_solved_one(run, mo
     assert not asked & {context_id(2, "train", state) for state in range(4)}  # what is solved is not asked
 
 
+def test_where_all_is_solved_nobody_asks(run, monkeypatch):
+    imagination, waves = imagining(monkeypatch, [[1, 1, 1, 1]] * 3, [[0, 0, 0, 0]] * 3)
+    with pytest.warns(UserWarning, match="all tasks are held, so adapting and LOOP are left out"):
+        assert Hold(run, "sft", "", imagination).everything
+    assert not waves
+
+
 def test_where_nothing_is_known_loop_is_left_out_and_that_is_said(run, monkeypatch):
     imagination, _ = imagining(monkeypatch, [[1, 0, 1, 0]] * 3, [[1, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 0]])
     with pytest.warns(UserWarning, match="0 solved and 3 unknown to imagination, so LOOP is left out"):

@@ -24,7 +24,8 @@ def score_episodes(reflector: Reflector, episodes: Episodes, *, rows_at_once: in
         rows_at_once: episodes whose frames are in memory at a time.
 
     Raises:
-        ValueError: for episodes that do not show the reflector's cameras at its size, and scores that are none.
+        ValueError: for episodes that do not show the reflector's cameras at its size; when scores are not of the
+            videos' frames, or no probabilities.
     """
     episodes.require("the reflector", reflector.cameras, reflector.image_size)
     steps = torch.arange(1, episodes["actions"].shape[1] + 1)
